@@ -1,0 +1,1 @@
+//! A density sequence in, a pack out.

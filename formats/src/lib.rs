@@ -1,0 +1,13 @@
+//! What smoke-bake reads and writes: volumes in, images in and out, scene files, and the pack.
+//!
+//! Nothing here knows about light or threads. Every reader is bounded: a count from a file is checked against the
+//! bytes that are there before anything is allocated, and an error names the file, the field, what was found and what
+//! was expected.
+
+pub mod bounded;
+pub mod error;
+pub mod gaussian;
+pub mod residual;
+pub mod volume;
+
+pub use error::{Error, Result};

@@ -1,0 +1,2 @@
+//! smoke-bake: bakes smoke sequences into relightable packs, and renders them.
+fn main() {}
