@@ -1,1 +1,11 @@
-//! Light in a participating medium.
+//! Light in a participating medium: a frame of a pack becomes a density, density and lights become source radiance,
+//! and a march through both becomes an image.
+
+pub mod camera;
+pub mod film;
+pub mod lanes;
+pub mod light;
+pub mod march;
+pub mod medium;
+pub mod sphere;
+pub mod transport;

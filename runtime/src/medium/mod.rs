@@ -1,0 +1,3 @@
+//! The medium: the density of one frame as the transport and the march see it.
+
+pub mod field;

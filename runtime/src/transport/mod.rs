@@ -1,0 +1,28 @@
+//! Density and lights to source radiance: one folder a method, all behind [`SourceRadiance`].
+
+pub mod compensated;
+pub mod medium;
+
+use crate::march::ShadedVolume;
+use crate::medium::field::DensityField;
+use glam::DVec3;
+
+/// Which orders of scattering are computed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum ScatteringOrder {
+    /// Light that was scattered once.
+    Single,
+    /// All of it.
+    #[default]
+    All,
+}
+
+/// The radiance that a frame's medium sends out at every point, into every direction: what transport makes and the
+/// march reads.
+pub trait SourceRadiance: Send + Sync {
+    /// True if the shaded volume must be made again when the camera moves.
+    fn depends_on_view(&self) -> bool;
+
+    /// The volume pass: source radiance towards `eye` (world space), with the density, on the field's nodes.
+    fn shade(&self, field: &DensityField, eye: DVec3) -> ShadedVolume;
+}
