@@ -1,0 +1,3 @@
+//! The density of one frame.
+
+pub mod gaussian_points;
