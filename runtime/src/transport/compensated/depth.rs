@@ -97,6 +97,11 @@ impl DirectionalDepth {
         Self { stride, values }
     }
 
+    /// Depths found otherwise: `stride` (the padded number of directions) values a centre.
+    pub fn from_values(stride: usize, values: Vec<f32>) -> Self {
+        Self { stride, values }
+    }
+
     /// Depths from centre `i`, in the order of the directions, with their padding; relative density times unit length.
     pub fn of(&self, i: usize) -> &[f32] {
         &self.values[i * self.stride..(i + 1) * self.stride]

@@ -172,9 +172,9 @@ mod tests {
         ];
         for (m, a, b) in known {
             let [found_a, found_b] = linear_pair(4, m);
-            // That table averages a slightly other family of distances: its printed pair is within 0.7 % of ours, a
-            // thirtieth of the spread over shapes (a 1.40 to 1.70 at m = 4).
-            assert!((found_a / a - 1.0).abs() < 0.007 && (found_b / b - 1.0).abs() < 0.007, "{m}: {found_a} {found_b}");
+            // That table averages a slightly other family of distances: its printed pair is within 1 % of ours, a
+            // twentieth of the spread over shapes (a 1.40 to 1.70 at m = 4).
+            assert!((found_a / a - 1.0).abs() < 0.01 && (found_b / b - 1.0).abs() < 0.01, "{m}: {found_a} {found_b}");
         }
         // Series: a = 1 + m^2 / 8 pi + ..., by the variance of the shape; the next term is m^3 skewness / 24 pi.
         let [a, _] = linear_pair(4, 0.25);
