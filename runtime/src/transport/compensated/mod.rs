@@ -4,6 +4,7 @@
 pub mod centres;
 pub mod decay;
 pub mod depth;
+pub mod diffusion;
 pub mod exponential;
 pub mod gmres;
 pub mod integral;

@@ -133,7 +133,7 @@ mod tests {
     use crate::transport::compensated::testing::{Pcg, cloud, points};
 
     #[test]
-    fn shares_sum_to_one_and_follow_the_gaussians() {
+    fn shares_sum_to_one_where_there_is_density() {
         let set = points(&cloud(100, 8));
         let grid = OverlapGrid::new(&set);
         let mut pcg = Pcg::new(3);
@@ -141,14 +141,6 @@ mod tests {
         for _ in 0..2000 {
             let at = [pcg.uniform() as f32, pcg.uniform() as f32, pcg.uniform() as f32];
             let (density, list) = grid.at(at);
-            let expected: f32 = (0..set.len())
-                .map(|h| {
-                    let q: f32 = (0..3).map(|a| ((at[a] - set.center[a][h]) / set.radius[h]).powi(2)).sum();
-                    if q < 9.0 { set.weight[h] * (-q).exp() } else { 0.0 }
-                })
-                .sum();
-            // Half a cell (0.007 sqrt 3 / 2) of the steepest slope 0.86 w / r, r >= 0.03, on up to about 5 at once.
-            assert!((density - expected).abs() < 0.9, "{density} {expected}");
             if density > 0.0 {
                 filled += 1;
                 assert!((list.iter().map(|e| e.1).sum::<f32>() - 1.0).abs() < 1e-5);
@@ -167,10 +159,18 @@ mod tests {
         for cell in (0..grid.density.len()).step_by(97).filter(|&c| grid.density[c] > 0.0) {
             let index = [cell % grid.dims[0], cell / grid.dims[0] % grid.dims[1], cell / grid.dims[0] / grid.dims[1]];
             let at: [f32; 3] = std::array::from_fn(|a| grid.low[a] + (index[a] as f32 + 0.5) / grid.per_unit);
-            for &(h, share) in grid.at(at).1 {
-                let h = h as usize;
+            let term = |h: usize| {
                 let q: f64 = (0..3).map(|a| f64::from((at[a] - set.center[a][h]) / set.radius[h]).powi(2)).sum();
-                let expected = f64::from(set.weight[h]) * (-q).exp() / f64::from(grid.density[cell]);
+                if q <= 9.0 { f64::from(set.weight[h]) * (-q).exp() } else { 0.0 }
+            };
+            let total: f64 = (0..set.len()).map(term).sum();
+            // A term at the cut, exp(-9) = 1.2e-4, may fall to either side of it.
+            assert!((f64::from(grid.density[cell]) - total).abs() < 4e-5 * total + 1.3e-4);
+            for &(h, share) in grid.at(at).1 {
+                let expected = term(h as usize) / f64::from(grid.density[cell]);
+                if expected == 0.0 {
+                    continue;
+                }
                 // q <= 9 from coordinates of size 1 rounded to 1e-7, divided by r: 2 sqrt(q) 1e-7 / 0.03 = 2e-5.
                 assert!((f64::from(share) / expected - 1.0).abs() < 4e-5);
                 seen += 1;
