@@ -42,9 +42,8 @@ pub struct GaussianPoints {
 impl GaussianPoints {
     /// Checks and transposes. A weight of zero is legal and adds nothing.
     pub fn new(gaussians: &[Gaussian]) -> Result<Self, GaussianError> {
-        let fail = |index, what, found: f32, expected| {
-            Err(GaussianError { index, what, found: f64::from(found), expected })
-        };
+        let fail =
+            |index, what, found: f32, expected| Err(GaussianError { index, what, found: f64::from(found), expected });
         for (index, g) in gaussians.iter().enumerate() {
             for &c in &g.center {
                 if !(c.abs() <= LARGEST) {

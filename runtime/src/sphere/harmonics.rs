@@ -84,7 +84,13 @@ pub const BAND: [usize; MAX_COEFFICIENTS] = {
 /// # Panics
 /// If `order > MAX_ORDER`.
 #[inline(always)]
-pub fn evaluate_lanes<const L: usize>(order: usize, x: &[f32; L], y: &[f32; L], z: &[f32; L], out: &mut [[f32; L]; MAX_COEFFICIENTS]) {
+pub fn evaluate_lanes<const L: usize>(
+    order: usize,
+    x: &[f32; L],
+    y: &[f32; L],
+    z: &[f32; L],
+    out: &mut [[f32; L]; MAX_COEFFICIENTS],
+) {
     assert!(order <= MAX_ORDER, "order {order} is above {MAX_ORDER}");
     // (x + iy)^m, and Q_mm = (-1)^m (2m-1)!!.
     let (mut real, mut imaginary, mut diagonal) = ([1.0f32; L], [0.0f32; L], 1.0f32);
@@ -186,7 +192,8 @@ mod tests {
             let y = evaluate(MAX_ORDER, directions.direction(q));
             for i in 0..MAX_COEFFICIENTS {
                 for j in 0..MAX_COEFFICIENTS {
-                    gram[i * MAX_COEFFICIENTS + j] += f64::from(directions.weights[q]) * f64::from(y[i]) * f64::from(y[j]);
+                    gram[i * MAX_COEFFICIENTS + j] +=
+                        f64::from(directions.weights[q]) * f64::from(y[i]) * f64::from(y[j]);
                 }
             }
         }

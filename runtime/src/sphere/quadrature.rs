@@ -64,8 +64,13 @@ impl Directions {
         assert!(polar > 0 && azimuth > 0, "{polar} x {azimuth} directions");
         let count = polar * azimuth;
         let padded = count.next_multiple_of(LANES);
-        let mut out =
-            Self { count, x: vec![0.0; padded], y: vec![0.0; padded], z: vec![1.0; padded], weights: vec![0.0; padded] };
+        let mut out = Self {
+            count,
+            x: vec![0.0; padded],
+            y: vec![0.0; padded],
+            z: vec![1.0; padded],
+            weights: vec![0.0; padded],
+        };
         let (nodes, weights) = gauss_legendre(polar);
         for (ring, (&z, &w)) in nodes.iter().zip(&weights).enumerate() {
             let sine = (1.0 - z * z).sqrt();

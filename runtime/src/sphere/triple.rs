@@ -120,7 +120,12 @@ mod tests {
             }
             for i in 0..count {
                 // Up to about 100 f32 terms of size < 1 land on one coefficient: 100 * 6e-8, and the tensor's own 1e-6.
-                assert!((f64::from(found[i]) - expected[i]).abs() < 2e-5, "order {order}, {i}: {} {}", found[i], expected[i]);
+                assert!(
+                    (f64::from(found[i]) - expected[i]).abs() < 2e-5,
+                    "order {order}, {i}: {} {}",
+                    found[i],
+                    expected[i]
+                );
             }
         }
     }

@@ -115,7 +115,8 @@ mod tests {
             for c in 0..3 {
                 let absorbed = |s: f32, a: f32| f64::from(s) * (1.0 - f64::from(a));
                 assert!(
-                    (absorbed(plain.sigma_t[c], plain.albedo[c]) - absorbed(banded.sigma_t[c], banded.albedo[c])).abs() < 2e-6
+                    (absorbed(plain.sigma_t[c], plain.albedo[c]) - absorbed(banded.sigma_t[c], banded.albedo[c])).abs()
+                        < 2e-6
                 );
                 let transport = |s: f32, a: f32, g: f32| f64::from(s) * (1.0 - f64::from(a) * f64::from(g));
                 let expected = transport(plain.sigma_t[c], plain.albedo[c], g);
@@ -137,7 +138,8 @@ mod tests {
             sum
         };
         for order in 1..=6 {
-            let lowest = |moments: &[f32; 6]| (0..=200).map(|i| value(moments, i as f64 / 100.0 - 1.0)).fold(9.0, f64::min);
+            let lowest =
+                |moments: &[f32; 6]| (0..=200).map(|i| value(moments, i as f64 / 100.0 - 1.0)).fold(9.0, f64::min);
             assert!(lowest(&medium(-0.99).banded(order).moments) > -1e-6, "order {order}");
             if order > 1 {
                 let plain: [f32; 6] = std::array::from_fn(|l| if l < order { (-0.99f32).powi(l as i32) } else { 0.0 });

@@ -33,6 +33,8 @@ pub struct CentreRadiance {
     /// Extinction to march with, per unit density and world length. Below the user's where a strong forward peak counts
     /// as not scattered.
     pub sigma_t: [f32; 3],
+    /// Mean multiply scattered radiance at the centres, from diffusion only (else empty): a start for its next solve.
+    pub level: Vec<[f32; 3]>,
 }
 
 /// Radiance that comes in from outside, the same at every point of the smoke.
@@ -117,7 +119,7 @@ impl Basis {
     }
 }
 
-/// Adds nothing where a scattering coefficient is zero, and scales by `albedo * moment` per band.
+/// Writes one channel, scaled by `albedo * moment` per band.
 fn scatter(coefficients: &[f32], gains: &[f32; MAX_ORDER], channel: usize, out: &mut [[f32; 3]]) {
     for (k, (value, out)) in coefficients.iter().zip(out).enumerate() {
         out[channel] = gains[BAND[k]] * value;
@@ -235,7 +237,13 @@ mod tests {
         IncidentRadiance::Sampled(vec![[1.0, 2.0, 0.5]; directions.len()])
     }
 
-    fn direct(points: &GaussianPoints, scale: f64, medium: &BandedMedium, light: &IncidentRadiance, d: &Directions) -> Vec<[f32; 3]> {
+    fn direct(
+        points: &GaussianPoints,
+        scale: f64,
+        medium: &BandedMedium,
+        light: &IncidentRadiance,
+        d: &Directions,
+    ) -> Vec<[f32; 3]> {
         let depth = DirectionalDepth::new(points, d);
         scatter_directions(&depth, points.len(), [scale; 3], medium, &light.sampled(d), &Basis::new(4, d))
     }
@@ -270,7 +278,8 @@ mod tests {
                 let t: f64 = (0..set.len())
                     .map(|h| {
                         let r = f64::from(set.radius[h]);
-                        let to = glam::DVec3::from(set.center_of(h).map(f64::from)) - glam::DVec3::from(set.center_of(i).map(f64::from));
+                        let to = glam::DVec3::from(set.center_of(h).map(f64::from))
+                            - glam::DVec3::from(set.center_of(i).map(f64::from));
                         let mu = if h == i { 0.0 } else { to.normalize().dot(w) };
                         f64::from(set.weight[h]) * r * ray_depth(to.length() / r, mu)
                     })
@@ -326,7 +335,8 @@ mod tests {
         let set = points(&cloud(1, 1));
         let d = Directions::product(7, 14);
         let from = |sign: f32| IncidentRadiance::Sampled((0..d.len()).map(|q| [(sign * d.z[q]).max(0.0); 3]).collect());
-        let (up, down) = (direct(&set, 5.0, &grey(1.0, 0.5), &from(1.0), &d), direct(&set, 5.0, &grey(1.0, 0.5), &from(-1.0), &d));
+        let (up, down) =
+            (direct(&set, 5.0, &grey(1.0, 0.5), &from(1.0), &d), direct(&set, 5.0, &grey(1.0, 0.5), &from(-1.0), &d));
         assert!(up[2][0] > 0.01, "forward scattered light goes on: J is larger looking at the light");
         for k in 0..16 {
             let sign = if BAND[k] % 2 == 1 { -1.0 } else { 1.0 };
@@ -351,9 +361,11 @@ mod tests {
     #[test]
     fn harmonic_and_sampled_light_say_the_same() {
         let d = Directions::product(7, 14);
-        let sampled = IncidentRadiance::Sampled((0..d.len()).map(|q| [2.0 + d.x[q] * d.y[q], 1.0, 1.0 + d.z[q]]).collect());
+        let sampled =
+            IncidentRadiance::Sampled((0..d.len()).map(|q| [2.0 + d.x[q] * d.y[q], 1.0, 1.0 + d.z[q]]).collect());
         let harmonics = sampled.harmonics(4, &d);
-        let light = IncidentRadiance::Harmonics((0..16).map(|k| [harmonics[0][k], harmonics[1][k], harmonics[2][k]]).collect());
+        let light =
+            IncidentRadiance::Harmonics((0..16).map(|k| [harmonics[0][k], harmonics[1][k], harmonics[2][k]]).collect());
         for c in 0..3 {
             for (a, b) in light.sampled(&d)[c].iter().zip(&sampled.sampled(&d)[c]) {
                 assert!((a - b).abs() < 1e-5);

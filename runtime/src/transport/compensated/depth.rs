@@ -144,7 +144,8 @@ mod tests {
         (0..points.len())
             .map(|h| {
                 let radius = f64::from(points.radius[h]);
-                let to = glam::DVec3::from(points.center_of(h).map(f64::from)) - glam::DVec3::from(points.center_of(i).map(f64::from));
+                let to = glam::DVec3::from(points.center_of(h).map(f64::from))
+                    - glam::DVec3::from(points.center_of(i).map(f64::from));
                 let d = to.length() / radius;
                 let mu = if d > 0.0 { to.normalize().dot(w) } else { 0.0 };
                 f64::from(points.weight[h]) * radius * ray_depth(d, mu)
@@ -227,10 +228,17 @@ mod tests {
         let gaussians = cloud(12, 5);
         let scaled: Vec<_> = gaussians
             .iter()
-            .map(|g| smoke_formats::gaussian::Gaussian { center: g.center.map(|c| c * 1024.0), radius: g.radius * 1024.0, ..*g })
+            .map(|g| smoke_formats::gaussian::Gaussian {
+                center: g.center.map(|c| c * 1024.0),
+                radius: g.radius * 1024.0,
+                ..*g
+            })
             .collect();
         let directions = Directions::product(3, 6);
-        let (a, b) = (DirectionalDepth::new(&points(&gaussians), &directions), DirectionalDepth::new(&points(&scaled), &directions));
+        let (a, b) = (
+            DirectionalDepth::new(&points(&gaussians), &directions),
+            DirectionalDepth::new(&points(&scaled), &directions),
+        );
         assert!(a.values.iter().zip(&b.values).all(|(a, b)| a * 1024.0 == *b));
     }
 }

@@ -183,10 +183,18 @@ impl Diffusion {
     }
 
     /// L0 by damped CGLS on rows of length 1.
-    fn solve(&self, sources: &[Moments], optical_scale: f64, transport: f64, albedo: f64, start: Option<&[f32]>) -> Vec<f64> {
+    fn solve(
+        &self,
+        sources: &[Moments],
+        optical_scale: f64,
+        transport: f64,
+        albedo: f64,
+        start: Option<&[f32]>,
+    ) -> Vec<f64> {
         let n = self.count;
         // 3 sigma_a sigma_tr D^2 is subtracted from the geometry, as a factor of the share.
-        let absorbed: Vec<f64> = self.density.iter().map(|d| 3.0 * optical_scale * (1.0 - albedo) * transport * d * d).collect();
+        let absorbed: Vec<f64> =
+            self.density.iter().map(|d| 3.0 * optical_scale * (1.0 - albedo) * transport * d * d).collect();
         let row = |i: usize| (&self.geometry[i * n..(i + 1) * n], &self.share[i * n..(i + 1) * n]);
         let (scale, right): (Vec<f64>, Vec<f64>) = (0..n)
             .into_par_iter()
@@ -314,7 +322,11 @@ mod tests {
         };
         for i in 0..30 {
             let (at, h) = (system.centers[i], 1e-4);
-            let shifted = |k: usize, by: f64| { let mut p = at; p[k] += by; p };
+            let shifted = |k: usize, by: f64| {
+                let mut p = at;
+                p[k] += by;
+                p
+            };
             let (density, l) = fields(at);
             let kappa = |p: [f64; 3]| 1.0 / (3.0 * sigma_tr * fields(p).0);
             let mut divergence = 0.0;
@@ -327,7 +339,8 @@ mod tests {
             let mut found = 0.0;
             let mut size = 0.0;
             for j in 0..30 {
-                let entry = system.geometry[i * 30 + j] - 3.0 * sigma_a * sigma_tr * density * density * system.share[i * 30 + j];
+                let entry = system.geometry[i * 30 + j]
+                    - 3.0 * sigma_a * sigma_tr * density * density * system.share[i * 30 + j];
                 found += entry * level[j];
                 size += (entry * level[j]).abs();
             }

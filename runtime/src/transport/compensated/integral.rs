@@ -136,7 +136,14 @@ impl IntegralTransport {
     /// Solves `x = J_ss + F K x` on the matrix's bands; bands above keep single scattering. `start` (same layout as
     /// `radiance`) speeds up a solve after a small edit. Radiance means below zero, possible only where the solve
     /// stopped early, are set to zero.
-    pub fn add(&self, radiance: &mut [[f32; 3]], order: usize, channel: usize, gains: &[f32; MAX_ORDER], start: Option<&[[f32; 3]]>) -> Solved {
+    pub fn add(
+        &self,
+        radiance: &mut [[f32; 3]],
+        order: usize,
+        channel: usize,
+        gains: &[f32; MAX_ORDER],
+        start: Option<&[[f32; 3]]>,
+    ) -> Solved {
         let (n, stride, coefficients) = (self.count, order * order, (self.bands * self.bands).min(order * order));
         let size = n * self.bands * self.bands;
         let gather = |from: &[[f32; 3]]| -> Vec<f64> {
@@ -240,10 +247,18 @@ mod tests {
 
         /// Order-2 single scattering of uniform light 1.
         fn single(&self, scale: f64, albedo: f32, g: f32) -> Vec<[f32; 3]> {
-            let medium = crate::transport::medium::MediumParameters { sigma_t: [1.0; 3], albedo: [albedo; 3], g }.banded(2);
+            let medium =
+                crate::transport::medium::MediumParameters { sigma_t: [1.0; 3], albedo: [albedo; 3], g }.banded(2);
             let basis = crate::transport::compensated::centres::Basis::new(2, &self.directions);
             let light = [(); 3].map(|()| vec![1.0; self.directions.padded()]);
-            crate::transport::compensated::centres::scatter_directions(&self.depth, self.set.len(), [scale; 3], &medium, &light, &basis)
+            crate::transport::compensated::centres::scatter_directions(
+                &self.depth,
+                self.set.len(),
+                [scale; 3],
+                &medium,
+                &light,
+                &basis,
+            )
         }
     }
 
@@ -256,7 +271,13 @@ mod tests {
             assert!(solved.residual < TOLERANCE, "{solved:?}");
             for (k, j) in j.iter().enumerate() {
                 // The residual 1e-6 grows by 1 / (1 - spectral radius), here below 300.
-                let expected = if k % 4 == 0 { ROOT } else if bands == 2 { 0.0 } else { continue };
+                let expected = if k % 4 == 0 {
+                    ROOT
+                } else if bands == 2 {
+                    0.0
+                } else {
+                    continue;
+                };
                 assert!((j[0] - expected).abs() < 1e-3, "depth scale {scale}, g {g}, {k}: {}", j[0]);
             }
         }
@@ -270,7 +291,9 @@ mod tests {
         assert!(matrix.planes[0].iter().all(|&k| k >= 0.0));
         for i in 0..40 {
             let sum: f64 = matrix.planes[0][i * 40..(i + 1) * 40].iter().map(|&v| f64::from(v)).sum();
-            let tau: f64 = (0..98).map(|q| f64::from(case.directions.weights[q]) * (-scale * f64::from(case.depth.of(i)[q])).exp()).sum();
+            let tau: f64 = (0..98)
+                .map(|q| f64::from(case.directions.weights[q]) * (-scale * f64::from(case.depth.of(i)[q])).exp())
+                .sum();
             assert!((sum - (1.0 - tau / (4.0 * std::f64::consts::PI))).abs() < 2e-6, "row {i}");
         }
     }
@@ -297,7 +320,8 @@ mod tests {
     fn shares(set: &GaussianPoints, at: [f64; 3]) -> (Vec<f64>, f64) {
         let terms: Vec<f64> = (0..set.len())
             .map(|h| {
-                let q: f64 = (0..3).map(|a| ((at[a] - f64::from(set.center[a][h])) / f64::from(set.radius[h])).powi(2)).sum();
+                let q: f64 =
+                    (0..3).map(|a| ((at[a] - f64::from(set.center[a][h])) / f64::from(set.radius[h])).powi(2)).sum();
                 f64::from(set.weight[h]) * (-q).exp()
             })
             .collect();
@@ -363,7 +387,13 @@ mod tests {
                     weight *= albedo;
                     let (terms, total) = shares(&case.set, at);
                     let mut pick = pcg.uniform() * total;
-                    place = terms.iter().position(|t| { pick -= t; pick < 0.0 }).unwrap_or(4);
+                    place = terms
+                        .iter()
+                        .position(|t| {
+                            pick -= t;
+                            pick < 0.0
+                        })
+                        .unwrap_or(4);
                 }
                 sum += weight;
                 squares += weight * weight;
@@ -385,7 +415,9 @@ mod tests {
             let mut j = one.single(scale, 0.99, 0.0);
             one.matrix(scale, 1).add(&mut j, 2, 0, &[0.99, 0.0, 0.0, 0.0, 0.0, 0.0], None);
             // One equation: J = albedo tau / (1 - albedo (1 - tau)).
-            let t: f64 = (0..98).map(|q| f64::from(one.directions.weights[q]) * (-scale * f64::from(one.depth.of(0)[q])).exp()).sum();
+            let t: f64 = (0..98)
+                .map(|q| f64::from(one.directions.weights[q]) * (-scale * f64::from(one.depth.of(0)[q])).exp())
+                .sum();
             let tau = t / (4.0 * std::f64::consts::PI);
             let expected = 0.99 * tau / (1.0 - 0.99 * (1.0 - tau));
             assert!((f64::from(j[0][0] / ROOT) - expected).abs() < 2e-4 * expected.max(1e-3), "{scale}: {expected}");

@@ -9,6 +9,8 @@ pub mod exponential;
 pub mod gmres;
 pub mod integral;
 pub mod overlap;
+pub mod route;
+pub mod volume_pass;
 pub mod zonal;
 
 #[cfg(test)]

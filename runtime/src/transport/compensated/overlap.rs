@@ -47,10 +47,20 @@ impl OverlapGrid {
         }
         let longest = (0..3).map(|a| f64::from(high[a]) - f64::from(low[a])).fold(0.0, f64::max);
         let cell = (longest / RESOLUTION).max((lists / LARGEST_LISTS).cbrt());
-        let dims: [usize; 3] = std::array::from_fn(|a| (((f64::from(high[a]) - f64::from(low[a])) / cell).ceil() as usize).clamp(1, RESOLUTION as usize + 1));
+        let dims: [usize; 3] = std::array::from_fn(|a| {
+            (((f64::from(high[a]) - f64::from(low[a])) / cell).ceil() as usize).clamp(1, RESOLUTION as usize + 1)
+        });
         let slabs: Vec<Vec<Vec<(u32, f32)>>> =
             (0..dims[2]).into_par_iter().map(|k| slab(points, low, cell as f32, [dims[0], dims[1]], k)).collect();
-        let mut grid = Self { low, high, per_unit: (1.0 / cell) as f32, dims, starts: vec![0], entries: Vec::new(), density: Vec::new() };
+        let mut grid = Self {
+            low,
+            high,
+            per_unit: (1.0 / cell) as f32,
+            dims,
+            starts: vec![0],
+            entries: Vec::new(),
+            density: Vec::new(),
+        };
         for mut list in slabs.into_iter().flatten() {
             let density: f32 = list.iter().map(|e| e.1).sum();
             // Below the smallest normal number shares lose their digits: no smoke there.
@@ -181,7 +191,8 @@ mod tests {
 
     #[test]
     fn lists_stay_bounded_and_odd_sets_are_served() {
-        let wide: Vec<_> = cloud(3000, 5).into_iter().map(|g| smoke_formats::gaussian::Gaussian { radius: 0.3, ..g }).collect();
+        let wide: Vec<_> =
+            cloud(3000, 5).into_iter().map(|g| smoke_formats::gaussian::Gaussian { radius: 0.3, ..g }).collect();
         let grid = OverlapGrid::new(&points(&wide));
         assert!((grid.entries.len() as f64) < 1.3 * LARGEST_LISTS, "{}", grid.entries.len());
         assert_eq!(OverlapGrid::new(&points(&[])).at([0.5; 3]).1.len(), 0);

@@ -50,11 +50,7 @@ pub fn ray_depth(d: f64, mu: f64) -> f64 {
     let along = d * mu;
     let half = PI.sqrt() / 2.0;
     let beside = (d * d * (1.0 - mu * mu)).max(0.0);
-    if along < 0.0 {
-        half * (-d * d).exp() * erfcx(-along)
-    } else {
-        half * (-beside).exp() * (1.0 + erf(along))
-    }
+    if along < 0.0 { half * (-d * d).exp() * erfcx(-along) } else { half * (-beside).exp() * (1.0 + erf(along)) }
 }
 
 /// `G(k/2)` for k > 0.
@@ -156,7 +152,9 @@ mod tests {
     #[test]
     fn the_error_function_has_its_known_values() {
         // Abramowitz & Stegun, tables 7.1 and 7.2; erfcx(10) from the asymptotic series.
-        for (x, value) in [(0.5, 0.520_499_877_813_046_5), (1.0, 0.842_700_792_949_714_9), (2.0, 0.995_322_265_018_952_7)] {
+        for (x, value) in
+            [(0.5, 0.520_499_877_813_046_5), (1.0, 0.842_700_792_949_714_9), (2.0, 0.995_322_265_018_952_7)]
+        {
             assert!((erf(x) - value).abs() < 2e-15 && erf(-x) == -erf(x));
         }
         assert!((erfcx(10.0) - 0.056_140_992_743_822_58).abs() < 1e-15);
