@@ -1,3 +1,4 @@
 //! The medium: the density of one frame as the transport and the march see it.
 
 pub mod field;
+pub mod gaussian_points;
