@@ -8,6 +8,7 @@ pub mod bounded;
 pub mod error;
 pub mod gaussian;
 pub mod residual;
+pub mod vdb;
 pub mod volume;
 
 pub use error::{Error, Result};

@@ -38,6 +38,32 @@ impl VoxelMask {
         self.words[v / 64] |= 1 << (v % 64);
     }
 
+    /// Sets the voxels of a range, whose end is at most `len`.
+    pub fn set_range(&mut self, range: std::ops::Range<usize>) {
+        assert!(range.end <= self.len, "voxels {range:?} of {}", self.len);
+        let mut v = range.start;
+        while v < range.end {
+            let count = (64 - v % 64).min(range.end - v);
+            self.words[v / 64] |= (u64::MAX >> (64 - count)) << (v % 64);
+            v += count;
+        }
+    }
+
+    /// Sets voxel `v + i` for each set bit `i` of `bits`; all of them must be below `len`.
+    #[inline]
+    pub fn or_bits(&mut self, v: usize, bits: u64) {
+        assert!(v + (64 - bits.leading_zeros() as usize) <= self.len, "voxels from {v} of {}", self.len);
+        if bits == 0 {
+            return;
+        }
+        let shift = v % 64;
+        self.words[v / 64] |= bits << shift;
+        let over = if shift == 0 { 0 } else { bits >> (64 - shift) };
+        if over != 0 {
+            self.words[v / 64 + 1] |= over;
+        }
+    }
+
     /// The number of voxels set.
     pub fn count(&self) -> usize {
         self.words.iter().map(|w| w.count_ones() as usize).sum()
