@@ -1,7 +1,7 @@
 #!/usr/bin/python3
 """Small files of every shape that OpenVDB's own library (pyopenvdb) can write, into FOLDER.
 
-    openvdb_files.py FOLDER
+    openvdb_files.py FOLDER [LABEL]
 
 Prints one line a float grid: file name, tab, grid name. Needs python3-openvdb and python3-numpy.
 """
@@ -26,7 +26,7 @@ def speckle(grid, seed, origin=(0, 0, 0), dims=(37, 21, 30), share=0.4):
     return grid
 
 
-def inactive(grid, values, dims=(40, 24, 24)):
+def inactive(grid, values, dims=(24, 16, 8)):
     """Whole leaves whose inactive voxels hold just the given values: the seven node codes of active-mask compression."""
     random = np.random.default_rng(5)
     accessor = grid.getAccessor()
@@ -60,7 +60,7 @@ def cases():
         yield f"one_voxel_half_{half}", [one]
     yield "negative", [speckle(float_grid(), 3, origin=(-4100, -9, -130))]
     far = float_grid(half=True)
-    for ijk in [(-9000, 0, 0), (9000, 5, 3), (0, -60, 60)]:
+    for ijk in [(-5000, 0, 0), (5000, 5, 3), (0, -2, 4)]:
         far.getAccessor().setValueOn(ijk, 0.5)
     yield "far_apart", [far]
     for background in (0.0, 0.25):
@@ -105,8 +105,10 @@ def cases():
 
 
 if __name__ == "__main__":
-    folder = sys.argv[1]
+    folder, only = sys.argv[1], sys.argv[2:]
     for label, grids in cases():
+        if only and label not in only:
+            continue
         vdb.write(f"{folder}/{label}.vdb", grids=grids)
         for grid in grids:
             if isinstance(grid, vdb.FloatGrid):
