@@ -3,7 +3,7 @@
 //! The expectation comes from `openvdb_expectation.py`, which uses pyopenvdb alone (Debian: python3-openvdb,
 //! python3-numpy). A missing library is a failure, not a skip.
 
-use glam::DVec3;
+use glam::{DAffine3, DMat3, DVec3};
 use smoke_formats::vdb;
 use smoke_formats::volume::{DensityGrid, VoxelMask};
 use std::path::{Path, PathBuf};
@@ -161,6 +161,69 @@ fn the_comparison_sees_a_changed_value_state_box_or_map() {
         let mut bad = good.clone();
         defect(&mut bad);
         assert!(difference(&bad, &expected).is_some(), "defect {i} passed");
+    }
+}
+
+/// A grid with active and inactive voxels of many values, and room to spare in its box.
+fn speckle(origin: [i32; 3], dims: [usize; 3], world_from_index: DAffine3) -> DensityGrid {
+    let voxels = dims.iter().product();
+    let mut active = VoxelMask::new(voxels);
+    let mut values = vec![0.0; voxels];
+    let mut state = 12345u32;
+    for (v, value) in values.iter_mut().enumerate() {
+        state = state.wrapping_mul(1664525).wrapping_add(1013904223);
+        match state >> 28 {
+            0..8 => active.set(v),
+            8 => *value = [0.25, -0.5, 1.75][v / 97 % 3],
+            _ => continue,
+        }
+        // Multiples of 2^-8 below 8: exact in half floats, so that one expectation serves both.
+        if active.get(v) {
+            *value = (state >> 17 & 0x7ff) as f32 / 256.0;
+        }
+    }
+    DensityGrid { name: "density".into(), origin, dims, values, active, world_from_index }
+}
+
+#[test]
+fn openvdb_reads_what_we_write() {
+    let rotated = DAffine3::from_axis_angle(DVec3::new(0.6, 0.0, 0.8), 0.4) * DAffine3::from_scale(DVec3::splat(0.3));
+    let translation = DVec3::new(1e4, -2.5, 0.125);
+    let maps = [
+        DAffine3::from_scale(DVec3::splat(0.1)),
+        DAffine3 { matrix3: DMat3::from_diagonal(DVec3::splat(0.1)), translation },
+        DAffine3::from_scale(DVec3::new(0.1, 0.2, -0.3)),
+        DAffine3 { matrix3: DMat3::from_diagonal(DVec3::new(0.1, 0.2, 0.3)), translation },
+        DAffine3 { matrix3: rotated.matrix3, translation },
+        DAffine3::from_translation(translation),
+    ];
+    let mut grids: Vec<DensityGrid> = maps.iter().map(|&map| speckle([-13, 4090, 5], [33, 21, 19], map)).collect();
+    grids.push(speckle([0; 3], [0; 3], maps[0]));
+    grids.push(speckle([-4097, 127, -1], [1, 1, 1], maps[0]));
+    grids[7].active.set(0);
+    let folder = tempfile::tempdir().unwrap();
+    let (mut files, mut written) = (Vec::new(), Vec::new());
+    for (i, grid) in grids.iter().enumerate() {
+        let options = [(false, false), (false, true), (true, false), (true, true)];
+        // Every option with the rotated and the empty grid, one with each other.
+        for &(half, zip) in if [4, 6].contains(&i) { &options[..] } else { &options[i % 4..][..1] } {
+            let path = folder.path().join(format!("{i}_{half}_{zip}.vdb"));
+            vdb::write(&path, grid, &vdb::WriteOptions { half, zip }).unwrap();
+            files.push((path, grid.name.clone()));
+            written.push(grid);
+        }
+    }
+    // OpenVDB and we read the same voxels, and those are the voxels that were written.
+    compare(&files);
+    for ((path, name), grid) in files.iter().zip(written) {
+        let back = vdb::read(path, name).unwrap();
+        assert_eq!(back.active.count(), grid.active.count());
+        assert_eq!(back.world_from_index, grid.world_from_index);
+        for v in 0..grid.len() {
+            let found = back.voxel(grid.index(v).map(|i| i as i32));
+            let (value, active) = found.map_or((0.0, false), |f| (back.values[f], back.active.get(f)));
+            assert_eq!((value, active), (grid.values[v], grid.active.get(v)), "{} voxel {v}", path.display());
+        }
     }
 }
 

@@ -9,7 +9,9 @@
 //! dense box (`dense`). The voxels are those of OpenVDB's `tree.getValue`, bit for bit, and the tests compare them with
 //! OpenVDB's own library.
 //!
-//! Memory is the file, the dense box, and less than the file for the list of leaves, whatever the bytes say.
+//! Written: the same voxels, active set and map, with background zero (`write`).
+//!
+//! Memory of a reader is the file, the dense box, and less than the file for the list of leaves, whatever the bytes say.
 //! Format: OpenVDB 12 (Museth 2013, "VDB: High-Resolution Sparse Volumes with Dynamic Topology"); no written
 //! specification exists, so each file here names the part of the library whose behaviour it follows.
 
@@ -20,12 +22,17 @@ mod header;
 mod topology;
 mod transform;
 mod values;
+#[cfg(test)]
+mod tests;
+mod write;
 
 use crate::bounded::Bytes;
 use crate::volume::DensityGrid;
 use crate::{Error, Result};
 use directory::Directory;
 use std::path::Path;
+
+pub use write::{WriteOptions, write};
 
 /// What a file says about one of its grids.
 #[derive(Clone, Debug, PartialEq, Eq)]
