@@ -8,8 +8,12 @@ pub mod atomic;
 pub mod bounded;
 pub mod error;
 pub mod gaussian;
+pub mod mitsuba_vol;
+pub mod pbrt;
 pub mod residual;
+pub mod sequence;
 pub mod vdb;
 pub mod volume;
+pub mod volume_file;
 
 pub use error::{Error, Result};

@@ -4,6 +4,8 @@ use crate::{Error, Result};
 use glam::DAffine3;
 use std::path::Path;
 
+pub use crate::volume_file::read;
+
 /// One bit a voxel, in voxel order (x fastest): bit `v % 64` of word `v / 64`. Bits past `len` are zero.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct VoxelMask {

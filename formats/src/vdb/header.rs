@@ -7,7 +7,7 @@ use crate::bounded::Bytes;
 use crate::{Error, Result};
 
 /// The first eight bytes: `0x56444220` as a little-endian i64.
-pub(super) const MAGIC: [u8; 8] = *b" BDV\0\0\0\0";
+pub(crate) const MAGIC: [u8; 8] = *b" BDV\0\0\0\0";
 /// Oldest file version read: the first with a code byte in front of each node's values.
 pub(super) const FIRST_VERSION: u32 = 222;
 /// Newest file version read, and the one written.

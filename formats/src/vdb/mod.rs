@@ -32,6 +32,7 @@ use crate::{Error, Result};
 use directory::Directory;
 use std::path::Path;
 
+pub(crate) use header::MAGIC;
 pub use write::{WriteOptions, write};
 
 /// What a file says about one of its grids.
