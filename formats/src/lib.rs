@@ -4,10 +4,16 @@
 //! bytes that are there before anything is allocated, and an error names the file, the field, what was found and what
 //! was expected.
 
+pub mod atomic;
 pub mod bounded;
 pub mod error;
 pub mod gaussian;
+pub mod mitsuba_vol;
+pub mod pbrt;
 pub mod residual;
+pub mod sequence;
+pub mod vdb;
 pub mod volume;
+pub mod volume_file;
 
 pub use error::{Error, Result};
