@@ -4,10 +4,13 @@
 //! bytes that are there before anything is allocated, and an error names the file, the field, what was found and what
 //! was expected.
 
+pub mod atomic;
 pub mod bounded;
 pub mod error;
 pub mod gaussian;
+pub mod image;
 pub mod residual;
+pub mod scene;
 pub mod volume;
 
 pub use error::{Error, Result};
