@@ -96,17 +96,21 @@ pub fn read(path: &Path) -> Result<FloatImage> {
     }
 }
 
-/// Reads an environment map: finite, non-negative linear radiance.
-pub fn read_environment(path: &Path) -> Result<RgbImage> {
-    let image = read(path)?.rgb(path)?;
-    let bad = image.pixels.iter().position(|p| !p.iter().all(|v| v.is_finite() && *v >= 0.0));
-    match bad {
-        None => Ok(image),
-        Some(i) => {
-            let what = format!("pixel ({}, {})", i % image.width, i / image.width);
-            Err(Error::invalid(path, what, format!("{:?}", image.pixels[i]), "finite radiance, not negative"))
-        }
+/// Reads an environment map: finite linear radiance, at least 0. Also returns how many samples were negative: colours
+/// outside the gamut and lossy compression leave some in real maps (`-6e-6` beside a sun of 3000), and they are set to
+/// zero. A sample that is not finite is an error that names its pixel.
+pub fn read_environment(path: &Path) -> Result<(RgbImage, usize)> {
+    let mut image = read(path)?.rgb(path)?;
+    if let Some(i) = image.pixels.iter().position(|p| !p.iter().all(|v| v.is_finite())) {
+        let what = format!("pixel ({}, {})", i % image.width, i / image.width);
+        return Err(Error::invalid(path, what, format!("{:?}", image.pixels[i]), "finite radiance"));
     }
+    let mut negative = 0;
+    for v in image.pixels.iter_mut().flatten().filter(|v| **v < 0.0) {
+        *v = 0.0;
+        negative += 1;
+    }
+    Ok((image, negative))
 }
 
 /// Checks a size before anything is allocated for it.
@@ -160,13 +164,17 @@ mod tests {
     }
 
     #[test]
-    fn an_environment_with_a_planted_nan_or_negative_pixel_is_refused_by_position() {
+    fn an_environment_with_a_planted_nan_is_refused_by_position_and_negative_samples_are_counted() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.exr");
-        for bad in [f32::NAN, f32::INFINITY, -1e-6] {
-            let mut image = constant(&["R", "G", "B"]);
-            write_channels(&path, &image).unwrap();
-            assert!(read_environment(&path).is_ok());
+        let mut image = constant(&["R", "G", "B"]);
+        write_channels(&path, &image).unwrap();
+        assert_eq!(read_environment(&path).unwrap().1, 0);
+        image.channels[1].values[1] = -1e-6;
+        write_channels(&path, &image).unwrap();
+        let (clamped, negative) = read_environment(&path).unwrap();
+        assert_eq!((clamped.pixels[1], negative), ([1.0, 0.0, 3.0], 1));
+        for bad in [f32::NAN, f32::INFINITY] {
             image.channels[1].values[1] = bad;
             write_channels(&path, &image).unwrap();
             assert!(read_environment(&path).unwrap_err().to_string().contains("pixel (1, 0)"));
