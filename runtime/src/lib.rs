@@ -1,1 +1,2 @@
 //! Light in a participating medium.
+pub mod image_difference;
