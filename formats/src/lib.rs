@@ -11,6 +11,7 @@ pub mod gaussian;
 pub mod image;
 pub mod residual;
 pub mod scene;
+pub mod toml_text;
 pub mod volume;
 
 pub use error::{Error, Result};

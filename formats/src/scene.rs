@@ -7,10 +7,9 @@
 //! bytes in any folder.
 
 mod file;
-mod locate;
 
 use crate::image::projection::{Pinhole, cross, unit};
-use crate::{Error, Result};
+use crate::{Error, Result, toml_text};
 use serde::{Serialize, Serializer};
 use std::path::{Path, PathBuf};
 
@@ -139,11 +138,11 @@ impl Scene {
 
     /// Reads and checks the text of a scene file; `path` is named in errors, and its folder resolves image paths.
     pub fn parse(path: &Path, text: &str) -> Result<Self> {
-        let file: file::SceneFile = toml::from_str(text).map_err(|e| locate::toml_error(path, text, &e))?;
+        let file: file::SceneFile = toml::from_str(text).map_err(|e| toml_text::error(path, text, &e))?;
         let folder = path.parent().unwrap_or(Path::new(""));
         let scene = file.into_scene(folder);
         scene.and_then(|scene| scene.problem().map_or(Ok(scene), Err)).map_err(|p| {
-            let what = format!("{}{}", locate::position(text, &p.key), p.key);
+            let what = format!("{}{}", toml_text::position(text, &p.key), p.key);
             Error::invalid(path, what, p.found, p.expected)
         })
     }

@@ -6,8 +6,8 @@ use std::path::Path;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
-/// One line for an error of the TOML reader.
-pub(super) fn toml_error(path: &Path, text: &str, error: &toml::de::Error) -> Error {
+/// One line for an error of the TOML reader: `path` and where in `text` it is.
+pub fn error(path: &Path, text: &str, error: &toml::de::Error) -> Error {
     let span = error.span().unwrap_or(0..0);
     let position = line_and_column(text, span.start);
     let message = error.message().lines().collect::<Vec<_>>().join(" ");
@@ -31,12 +31,12 @@ pub(super) fn toml_error(path: &Path, text: &str, error: &toml::de::Error) -> Er
             let expected = if expected == "f64" { "a number" } else { expected };
             Error::invalid(path, what, found, expected)
         }
-        None => Error::invalid(path, what, message, "the keys of a scene file"),
+        None => Error::invalid(path, what, message, "another value"),
     }
 }
 
-/// `line L, column C: ` of the value at dotted `key`, or of the closest table above it that is in the text.
-pub(super) fn position(text: &str, key: &str) -> String {
+/// `line L, column C: ` (or nothing, for a broken text) of the value at dotted `key`, or of the closest table above it that is in the text.
+pub fn position(text: &str, key: &str) -> String {
     let Ok(table) = DeTable::parse(text) else { return String::new() };
     let mut at = 0;
     let mut value: Option<&Spanned<DeValue<'_>>> = None;
@@ -97,7 +97,7 @@ fn key_at(table: &DeTable<'_>, span: &Range<usize>) -> String {
 }
 
 /// The known name at most two edits away from `given`, the closest first.
-fn closest<'a>(given: &str, known: &[&'a str]) -> Option<&'a str> {
+pub fn closest<'a>(given: &str, known: &[&'a str]) -> Option<&'a str> {
     let (distance, name) = known.iter().map(|name| (edits(given, name), *name)).min()?;
     (distance <= 2 && distance < name.len()).then_some(name)
 }
