@@ -31,10 +31,10 @@ const FLAG_ONLY: [&str; 3] = ["help", "version", "output"];
 /// The command line with the environment and the settings file `path`, if it exists, below it.
 pub fn command(path: &Path) -> Result<Command, Failure> {
     let command = with_environment(Cli::command());
-    match std::fs::read_to_string(path) {
+    match toml_text::read(path) {
         Ok(text) => Ok(with_file(command, path, &text)?),
-        Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(command),
-        Err(e) => Err(Error::io(path, e).into()),
+        Err(Error::Io { source, .. }) if source.kind() == std::io::ErrorKind::NotFound => Ok(command),
+        Err(e) => Err(e.into()),
     }
 }
 

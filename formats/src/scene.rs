@@ -16,9 +16,6 @@ use std::path::{Path, PathBuf};
 /// Most pixels of an image to render: 2^26.
 pub const MAX_RENDER_PIXELS: u64 = 1 << 26;
 
-/// Longest scene file that is read, in bytes.
-const MAX_FILE_BYTES: u64 = 1 << 20;
-
 /// Which world axis points to the sky; lights from environment images turn with it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -127,12 +124,7 @@ struct Problem {
 impl Scene {
     /// Reads and checks a scene file.
     pub fn read(path: &Path) -> Result<Self> {
-        let length = std::fs::metadata(path).map_err(|e| Error::io(path, e))?.len();
-        if length > MAX_FILE_BYTES {
-            let found = format!("{length} bytes");
-            return Err(Error::invalid(path, "scene file", found, format!("at most {MAX_FILE_BYTES} bytes")));
-        }
-        let text = std::fs::read_to_string(path).map_err(|e| Error::io(path, e))?;
+        let text = toml_text::read(path)?;
         Self::parse(path, &text)
     }
 

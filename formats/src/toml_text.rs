@@ -1,10 +1,27 @@
-//! Where in a TOML text an error is: line, column and dotted key; and what key may have been meant.
+//! TOML files that people write: reading them, and saying where an error is: line, column and dotted key; and what key
+//! may have been meant.
 
-use crate::Error;
+use crate::{Error, Result};
+use std::fs::File;
+use std::io::Read;
 use std::ops::Range;
 use std::path::Path;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
+
+/// Longest text that is read, in bytes.
+const MAX_BYTES: u64 = 1 << 20;
+
+/// Reads the text of a file, which may be at most 1 MiB long.
+pub fn read(path: &Path) -> Result<String> {
+    let mut text = String::new();
+    let io = |e| Error::io(path, e);
+    File::open(path).map_err(io)?.take(MAX_BYTES + 1).read_to_string(&mut text).map_err(io)?;
+    if text.len() as u64 > MAX_BYTES {
+        return Err(Error::invalid(path, "file size", "more", format!("at most {MAX_BYTES} bytes")));
+    }
+    Ok(text)
+}
 
 /// One line for an error of the TOML reader: `path` and where in `text` it is.
 pub fn error(path: &Path, text: &str, error: &toml::de::Error) -> Error {
@@ -141,5 +158,15 @@ mod tests {
         assert_eq!(line_and_column("ab\näöü = 1", 3), "line 2, column 1");
         assert_eq!(line_and_column("ab\näöü = 1", "ab\näö".len()), "line 2, column 3");
         assert_eq!(line_and_column("ab", 99), "line 1, column 3");
+    }
+
+    #[test]
+    fn a_text_longer_than_a_mebibyte_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.toml");
+        std::fs::write(&path, vec![b' '; 1 << 20]).unwrap();
+        assert_eq!(read(&path).unwrap().len(), 1 << 20);
+        std::fs::write(&path, vec![b' '; (1 << 20) + 1]).unwrap();
+        assert!(read(&path).unwrap_err().to_string().contains("file size: found more, expected at most 1048576"));
     }
 }

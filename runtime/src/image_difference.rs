@@ -273,9 +273,8 @@ mod tests {
         let d = compare(&pair(&t, &r)).unwrap();
         let close = |a: f64, b: f64| assert!((a - b).abs() <= 1e-14 * b.abs(), "{a} {b}");
         // One of 36 samples is off by 1.5; the reference's squares by their sums of squares.
-        let squares: f64 =
-            (0..12).map(|i| f64::from(i)).map(|i| (1.0 + i).powi(2) + (2.0 + 0.5 * i).powi(2) + 16.0).sum();
-        let sum: f64 = (0..12).map(|i| f64::from(i)).map(|i| 1.0 + i + 2.0 + 0.5 * i + 4.0).sum();
+        let squares: f64 = (0..12).map(f64::from).map(|i| (1.0 + i).powi(2) + (2.0 + 0.5 * i).powi(2) + 16.0).sum();
+        let sum: f64 = (0..12).map(f64::from).map(|i| 1.0 + i + 2.0 + 0.5 * i + 4.0).sum();
         close(d.all.rmse, 1.5 / 6.0);
         close(d.all.relative_rmse, 0.25 / (squares / 36.0).sqrt());
         close(d.all.psnr, 20.0 * (12.0_f64 / 0.25).log10());

@@ -20,6 +20,8 @@ pub use write_exr::{FrameMetadata, RenderedFrame, SETTINGS_ATTRIBUTE, SamplePrec
 pub use write_png::write_png;
 
 use crate::{Error, Result};
+use std::fs::File;
+use std::io::Read;
 use std::path::Path;
 
 /// Most pixels of an image that any reader accepts: 2^28, a map of 23,170 x 11,585.
@@ -27,6 +29,9 @@ pub const MAX_PIXELS: u64 = 1 << 28;
 
 /// Most samples over all channels that any reader accepts: 2^29 (2 GiB of f32), a 16k x 8k map with four channels.
 pub const MAX_SAMPLES: u64 = 1 << 29;
+
+/// Longest image file that is read: twice the largest image without compression.
+const MAX_FILE_BYTES: u64 = 2 * 4 * MAX_SAMPLES;
 
 /// One channel of a [`FloatImage`].
 #[derive(Clone, Debug, PartialEq)]
@@ -80,20 +85,25 @@ impl FloatImage {
 /// Reads an OpenEXR or Radiance HDR image, told apart by its first bytes. Values are as stored: check for NaN and
 /// infinities where they would hurt. Sizes are checked against [`MAX_PIXELS`] and [`MAX_SAMPLES`] first.
 pub fn read(path: &Path) -> Result<FloatImage> {
-    let bytes = std::fs::read(path).map_err(|e| Error::io(path, e))?;
-    match bytes.as_slice() {
-        [0x76, 0x2f, 0x31, 0x01, ..] => read_exr::decode(path, &bytes),
-        [b'#', b'?', ..] => read_hdr::decode(path, &bytes),
-        _ => {
-            let start: Vec<_> = bytes.iter().take(4).map(|b| format!("{b:02x}")).collect();
-            Err(Error::invalid(
-                path,
-                "first bytes",
-                format!("[{}]", start.join(" ")),
-                "an OpenEXR or Radiance HDR image",
-            ))
+    let io = |e| Error::io(path, e);
+    let mut file = File::open(path).map_err(io)?;
+    let mut bytes = Vec::new();
+    // The first bytes first: what is no image is not read to its end, which a device may not have.
+    file.by_ref().take(4).read_to_end(&mut bytes).map_err(io)?;
+    let decode = match bytes.as_slice() {
+        [0x76, 0x2f, 0x31, 0x01] => read_exr::decode,
+        [b'#', b'?', ..] => read_hdr::decode,
+        start => {
+            let start: Vec<_> = start.iter().map(|b| format!("{b:02x}")).collect();
+            let found = format!("[{}]", start.join(" "));
+            return Err(Error::invalid(path, "first bytes", found, "an OpenEXR or Radiance HDR image"));
         }
+    };
+    file.take(MAX_FILE_BYTES).read_to_end(&mut bytes).map_err(io)?;
+    if bytes.len() as u64 > MAX_FILE_BYTES {
+        return Err(Error::invalid(path, "file size", "more", format!("at most {MAX_FILE_BYTES} bytes")));
     }
+    decode(path, &bytes)
 }
 
 /// Reads an environment map: finite linear radiance, at least 0. Also returns how many samples were negative: colours

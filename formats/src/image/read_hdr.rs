@@ -64,4 +64,34 @@ mod tests {
         let starved = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 10000 +X 10000\n";
         assert!(decode(Path::new("a.hdr"), starved).unwrap_err().to_string().contains("bytes for 10000 x 10000"));
     }
+
+    #[test]
+    fn damaged_files_end_in_an_image_or_an_error_never_in_a_panic() {
+        // Four rows of 16 pixels, each component as one run of 16 (128 + 16), and one literal row.
+        let mut good = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 5 +X 16\n".to_vec();
+        for row in 0..4 {
+            good.extend([2, 2, 0, 16]);
+            (0..4).for_each(|c| good.extend([144, 100 + 10 * c + row]));
+        }
+        good.extend([2, 2, 0, 16]);
+        (0..4).for_each(|c| good.extend([16].into_iter().chain([120 + c; 16])));
+        let image = decode(Path::new("a.hdr"), &good).unwrap();
+        assert_eq!((image.width, image.height), (16, 5));
+        // Mantissa 100 with exponent 130: 100 / 256 * 2^2.
+        assert_eq!(image.channel("R").unwrap()[0], 1.5625);
+        let mut state = 1u64;
+        let mut random = move || {
+            state = state.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+            (state >> 33) as usize
+        };
+        for _ in 0..20_000 {
+            let mut bad = good.clone();
+            for _ in 0..=random() % 3 {
+                let at = random() % bad.len();
+                bad[at] ^= 1 << (random() % 8);
+            }
+            // The result does not matter; reaching the next round does.
+            let _ = decode(Path::new("a.hdr"), &bad);
+        }
+    }
 }
