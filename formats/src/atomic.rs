@@ -56,7 +56,7 @@ fn create_beside(path: &Path) -> std::io::Result<(PathBuf, File)> {
         hidden.push(name);
         hidden.push(format!(".{}-{number}.tmp", std::process::id()));
         let temporary = folder_of(path).join(hidden);
-        match OpenOptions::new().write(true).create_new(true).open(&temporary) {
+        match OpenOptions::new().read(true).write(true).create_new(true).open(&temporary) {
             Ok(file) => return Ok((temporary, file)),
             // Left behind by an earlier process of the same number.
             Err(e) if e.kind() == std::io::ErrorKind::AlreadyExists => {}

@@ -3,6 +3,7 @@
 
 pub mod camera;
 pub mod film;
+pub mod image_difference;
 pub mod lanes;
 pub mod light;
 pub mod march;
