@@ -1,1 +1,3 @@
 //! Light in a participating medium.
+
+pub mod medium;
