@@ -1,0 +1,6 @@
+//! The fit of Gaussians to a density sequence.
+
+pub mod descent;
+pub mod initial;
+pub mod lbfgsb;
+pub mod objective;
