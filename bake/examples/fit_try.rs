@@ -17,12 +17,13 @@ fn main() {
         let mut d = Descent::new(&o, x, env("M", 10.0) as usize, 1e-7, env("EV", 400.0) as usize).unwrap();
         print!("{path} start {:.4} ", d.cost);
         let every = env("RS", 20.0) as u64;
-        let mut next = 50;
+        let mut next = 50; let mut moved = 0;
         while d.advance(every).unwrap() && d.evaluations() < env("EV", 400.0) as usize {
-            if env("RS", 20.0) < 1e4 { d.rescale(); }
+            d.rescale(); let tp = env("TP", 0.0); let left = env("EV", 400.0) - d.evaluations() as f64;
+            if tp > 0.0 && left > env("LEFT", 40.0) { moved += smoke_baking::fit::teleport::teleport(&mut d, if tp == 1.0 { Default::default() } else { smoke_baking::fit::teleport::Rule::Single }); }
             if d.evaluations() >= next { print!(" {}:{:.5}", d.evaluations(), d.cost); next += 50; }
         }
         let s = t.elapsed().as_secs_f64();
-        println!(" end {}:{:.5} box {:.5} it {} {:.2}s {:.2}ms/eval", d.evaluations(), d.cost, o.box_error(&d.x), d.iterations, s, s / d.evaluations() as f64 * 1e3);
+        println!(" end {}:{:.5} box {:.5} it {} {:.2}s {:.2}ms/eval moved {moved}", d.evaluations(), d.cost, o.box_error(&d.x), d.iterations, s, s / d.evaluations() as f64 * 1e3);
     }
 }

@@ -37,6 +37,8 @@ pub struct Descent<'a> {
     /// Iterations so far.
     pub iterations: u64,
     finished: bool,
+    /// Evaluations outside the solver.
+    extra: usize,
 }
 
 impl<'a> Descent<'a> {
@@ -48,8 +50,7 @@ impl<'a> Descent<'a> {
         tolerance: f64,
         evaluations: usize,
     ) -> Result<Self, Error> {
-        let mut units = Vec::new();
-        natural_units(&x, objective, &mut units);
+        let units = natural_units(&x, objective);
         let (lower, upper) = bounds(&units);
         let solver = Lbfgsb::new(lower, upper, memory)?
             .gradient_tolerance(1e-9)
@@ -57,14 +58,14 @@ impl<'a> Descent<'a> {
             .max_evaluations(evaluations)
             .first_step(0.5);
         let mut new =
-            Self { objective, solver, units, x, gradient: Vec::new(), cost: 0.0, iterations: 0, finished: false };
+            Self { objective, solver, units, x, gradient: Vec::new(), cost: 0.0, iterations: 0, finished: false, extra: 0 };
         new.run(0)?;
         Ok(new)
     }
 
     /// Evaluations of the objective so far.
     pub fn evaluations(&self) -> usize {
-        self.solver.evaluations()
+        self.solver.evaluations() + self.extra
     }
 
     /// Goes on for at most so many iterations; false once the solver has nothing more to do.
@@ -96,10 +97,31 @@ impl<'a> Descent<'a> {
         Ok(())
     }
 
+    /// The objective.
+    pub fn objective(&self) -> &'a Objective {
+        self.objective
+    }
+
+    /// Puts the variables of some Gaussians where they are in `x`, if that lowers the cost; tells whether it did.
+    ///
+    /// The memory keeps what it knows of all other variables. Costs one evaluation.
+    pub fn try_move(&mut self, x: Vec<f64>, moved: &[usize]) -> bool {
+        let mut gradient = vec![0.0; x.len()];
+        let cost = self.objective.cost_gradient(&x, &mut gradient);
+        self.extra += 1;
+        if !(cost < self.cost) {
+            return false;
+        }
+        (self.x, self.gradient, self.cost, self.finished) = (x, gradient, cost, false);
+        let variables: Vec<usize> = moved.iter().flat_map(|g| g * VARIABLES..(g + 1) * VARIABLES).collect();
+        self.solver.forget(&variables);
+        self.rescale();
+        true
+    }
+
     /// Measures the variables in the units that are natural where they are now; the memory is carried over.
     pub fn rescale(&mut self) {
-        let old = std::mem::take(&mut self.units);
-        natural_units(&self.x, self.objective, &mut self.units);
+        let old = std::mem::replace(&mut self.units, natural_units(&self.x, self.objective));
         let ratio: Vec<f64> = old.iter().zip(&self.units).map(|(old, new)| old / new).collect();
         let (lower, upper) = bounds(&self.units);
         self.solver.rescale(&ratio, lower, upper);

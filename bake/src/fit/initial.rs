@@ -1,13 +1,16 @@
 //! Where a first fit starts: Gaussians spread over the density, one for an equal share of it each.
 //!
 //! The non-zero voxels are put in Morton order, which keeps neighbours together, and cut into n strata of equal
-//! `sum D^p`; each stratum gives one Gaussian at its centroid, with the radius of a ball-like region of its volume.
+//! `sum D`; each stratum gives one Gaussian at its centroid, with radius [`RADIUS`] times the edge of a cube of its volume.
 //! All weights then follow from one factor, `<S, D> / <S, S>`: the least-squares best for those centres and radii.
 //! Cost: one sort of the occupied voxels, one evaluation.
 
 use super::descent::{RADII, WEIGHTS};
 use super::objective::{Objective, VARIABLES};
 use smoke_formats::volume::DensityGrid;
+
+/// Measured: 0.7 starts at the same error as 1.0, costs a third of the voxels, and ends a little lower.
+const RADIUS: f64 = 0.7;
 
 /// The bits of `v < 2^21` spread to every third place.
 fn spread(v: usize) -> u64 {
@@ -16,15 +19,13 @@ fn spread(v: usize) -> u64 {
 
 /// Starting variables of `n` Gaussians for a grid whose objective exists.
 pub fn initial(grid: &DensityGrid, objective: &Objective, n: usize) -> Vec<f64> {
-    let power = std::env::var("P").ok().map_or(1.0, |s| s.parse().unwrap());
-    let rk = std::env::var("RK").ok().map_or(1.0, |s| s.parse().unwrap());
     let [nx, ny, _] = grid.dims;
     let mut voxels: Vec<(u64, usize)> = (0..grid.len())
         .filter(|&v| grid.values[v] > 0.0)
         .map(|v| (spread(v % nx) | spread(v / nx % ny) << 1 | spread(v / (nx * ny)) << 2, v))
         .collect();
     voxels.sort_unstable();
-    let share = |v: usize| f64::from(grid.values[v] / objective.peak()).powf(power);
+    let share = |v: usize| f64::from(grid.values[v] / objective.peak());
     let total: f64 = voxels.iter().map(|&(_, v)| share(v)).sum();
     let mut x = Vec::with_capacity(n * VARIABLES);
     let (mut sum, mut at) = (0.0, 0);
@@ -43,13 +44,13 @@ pub fn initial(grid: &DensityGrid, objective: &Objective, n: usize) -> Vec<f64> 
             continue;
         }
         let volume = (at - first) as f64 * voxel_volume;
-        let r = (rk * volume.cbrt()).clamp(RADII[0], RADII[1]);
+        let r = (RADIUS * volume.cbrt()).clamp(RADII[0], RADII[1]);
         let w = voxels[first..at].iter().map(|&(_, v)| f64::from(grid.values[v])).sum::<f64>() / (at - first) as f64;
         let w = w / f64::from(objective.peak());
         x.extend([centre[0] / mass, centre[1] / mass, centre[2] / mass, r, w.clamp(WEIGHTS[0], WEIGHTS[1])]);
     }
     let (mut sd, mut ss) = (0.0, 0.0);
-    objective.visit_errors(&x, |_, e, d| {
+    objective.errors(&x).visit(|_, e, d| {
         let (e, d) = (f64::from(e), f64::from(d));
         sd += (e + d) * d;
         ss += (e + d) * (e + d);

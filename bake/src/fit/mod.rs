@@ -4,3 +4,4 @@ pub mod descent;
 pub mod initial;
 pub mod lbfgsb;
 pub mod objective;
+pub mod teleport;

@@ -97,17 +97,11 @@ impl Objective {
         self.forward(x, &mut scratch, None) / self.energy
     }
 
-    /// `e = S - D` of every voxel, in units of the peak, passed to `visit` with the voxel's position in the grid, and
-    /// D, ascending.
-    pub fn visit_errors(&self, x: &[f64], mut visit: impl FnMut(usize, f32, f32)) {
+    /// `e = S - D` on every voxel that counts, at some Gaussians. Costs the forward half of an evaluation.
+    pub fn errors(&self, x: &[f64]) -> ErrorField<'_> {
         let mut scratch = self.scratch.lock().unwrap_or_else(PoisonError::into_inner);
-        self.forward(x, &mut scratch, self.mask.as_deref());
-        let nx = self.lattice.dims[0];
-        let rows = |field| <[Block]>::chunks(field, self.lattice.row_blocks());
-        for (row, (error, density)) in rows(&scratch.error).zip(rows(&self.density)).enumerate() {
-            let pairs = error.as_flattened().iter().zip(density.as_flattened());
-            pairs.take(nx).enumerate().for_each(|(i, (&e, &d))| visit(row * nx + i, e, d));
-        }
+        let cost = self.forward(x, &mut scratch, self.mask.as_deref()) / self.energy;
+        ErrorField { objective: self, field: scratch.error.clone(), cost }
     }
 
     /// Unit-space position of voxel `v` of the grid.
@@ -142,6 +136,49 @@ impl Objective {
             .collect();
         sums.iter().sum()
     }
+}
+
+/// The errors `e = S - D` of a set of Gaussians, in units of the peak.
+pub struct ErrorField<'a> {
+    objective: &'a Objective,
+    field: Vec<Block>,
+    /// The objective there.
+    pub cost: f64,
+}
+
+impl ErrorField<'_> {
+    /// Calls `visit` with every voxel's position in the grid, its error and its density, ascending.
+    pub fn visit(&self, mut visit: impl FnMut(usize, f32, f32)) {
+        let Lattice { dims: [nx, ..], .. } = self.objective.lattice;
+        let width = self.objective.lattice.row_blocks();
+        let rows = self.field.chunks(width).zip(self.objective.density.chunks(width));
+        for (row, (error, density)) in rows.enumerate() {
+            let pairs = error.as_flattened().iter().zip(density.as_flattened());
+            pairs.take(nx).enumerate().for_each(|(i, (&e, &d))| visit(row * nx + i, e, d));
+        }
+    }
+
+    /// The weight that a Gaussian put at `center` would best have, and by how much the objective would fall.
+    ///
+    /// `E(w) = sum (e + w B)^2` is least at `w = -sum e B / sum B^2`, lower by `(sum e B)^2 / sum B^2`.
+    pub fn gain(&self, center: [f64; 3], radius: f64) -> (f64, f64) {
+        let Objective { lattice, energy, .. } = self.objective;
+        let mut kernel = Kernel::default();
+        kernel.place(lattice, center, radius);
+        let found = -moments(&kernel, &self.field, lattice).zeroth;
+        let square = square_integral(radius, lattice.space.scale);
+        (found / square, if found > 0.0 { found * found / square / energy } else { 0.0 })
+    }
+
+    /// By how much the objective would rise without a Gaussian of this radius and weight whose weight is at its best.
+    pub fn loss(&self, radius: f64, weight: f64) -> f64 {
+        weight * weight * square_integral(radius, self.objective.lattice.space.scale) / self.objective.energy
+    }
+}
+
+/// `sum B^2` over all voxels of edge `h`, as the integral `(pi / 2)^(3/2) r^3 / h^3`.
+fn square_integral(radius: f64, h: f64) -> f64 {
+    std::f64::consts::FRAC_PI_2.powf(1.5) * (radius / h).powi(3)
 }
 
 /// `error = m (error - density)`; gives the sum of squares, f32 lanes within a block of 16 voxels, then f64.
@@ -187,18 +224,26 @@ impl CostGradient for Objective {
     }
 }
 
-/// The inverse root of the objective's Gauss–Newton curvature, variable by variable: units in which it is about 1.
+/// Units in which the objective's curvature is about 1 along every variable, from its Gauss–Newton diagonal.
 ///
 /// The sums over a Gaussian's voxels of squared derivatives are integrals of Gaussians: with
 /// `I = (pi / 2)^(3/2) r^3 / voxel volume`, `sum (dS/dw)^2 = I`, `sum (dS/dc)^2 = w^2 I / r^2`,
-/// `sum (dS/dr)^2 = (15 / 4) w^2 I / r^2`; times 2 over `sum D^2`.
-pub fn natural_units(x: &[f64], objective: &Objective, units: &mut Vec<f64>) {
-    let h = objective.lattice.space.scale;
-    units.clear();
+/// `sum (dS/dr)^2 = (15 / 4) w^2 I / r^2`; times 2 over `sum D^2`. Neighbours overlap, which makes the weights stiffer
+/// than the diagonal says, so centres and radii get [`CENTRE_UNIT`] and [`RADIUS_UNIT`] times their diagonal's unit.
+pub fn natural_units(x: &[f64], objective: &Objective) -> Vec<f64> {
+    let mut units = Vec::with_capacity(x.len());
     for g in x.chunks(VARIABLES) {
-        let (r, w) = (g[3], g[4]);
-        let root = (2.0 * (std::f64::consts::FRAC_PI_2).powf(1.5) * (r / h).powi(3) / objective.energy).sqrt();
-        let (centre, radius) = (r / (w * root), r / (w * root) / 3.75f64.sqrt());
-        units.extend([centre, centre, centre, radius, 1.0 / root]);
+        let (r, w) = (g[3], g[4].max(LEAST_WEIGHT));
+        let weight = (2.0 * square_integral(r, objective.lattice.space.scale) / objective.energy).sqrt().recip();
+        let centre = CENTRE_UNIT * weight * r / w;
+        units.extend([centre, centre, centre, RADIUS_UNIT * weight * r / w / 3.75f64.sqrt(), weight]);
     }
+    units
 }
+
+/// Measured, with [`RADIUS_UNIT`] and [`LEAST_WEIGHT`]: docs/decisions/fit-optimiser.md.
+const CENTRE_UNIT: f64 = 3.0;
+/// See [`CENTRE_UNIT`].
+const RADIUS_UNIT: f64 = 2.0;
+/// A weight below this is taken for this: the units of a vanishing Gaussian's centre would be too large to be of use.
+const LEAST_WEIGHT: f64 = 0.1;

@@ -1,0 +1,129 @@
+//! Moves Gaussians that do little to where they would do much.
+//!
+//! [`Rule::Single`] is the paper's (Zhou et al. 2008, section 5.1): the Gaussian of least integral `pi^(3/2) w r^3` goes
+//! to the voxel where the density most exceeds the sum.
+//!
+//! [`Rule::Batch`], the default, decides by the objective itself. Taking a Gaussian away costs about `w^2 sum B^2`;
+//! one more at c with radius r gains `(sum e B)^2 / sum B^2` at its best weight (the greedy step of matching pursuit,
+//! Mallat, Zhang 1993). Candidate places are the centroids of missing density in a grid of cells; pairs of the largest
+//! gains and the least losses are exchanged, several at once, as long as the gain is [`MARGIN`] times the loss.
+//! The optimiser keeps its memory, less the entries of the variables moved. A move that does not lower the cost
+//! is undone. Cost: a forward pass, three moments a candidate, and one evaluation.
+
+use super::descent::{Descent, RADII, WEIGHTS};
+use super::objective::VARIABLES;
+
+/// Which Gaussians move where.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+pub enum Rule {
+    /// The paper's: one Gaussian, to the voxel of the largest error.
+    Single,
+    /// Several, by expected gain and loss.
+    #[default]
+    Batch,
+}
+
+/// Radius of a Gaussian that the paper's rule moves.
+const SINGLE_RADIUS: f64 = 0.03;
+
+fn env(k: &str, d: f64) -> f64 { std::env::var(k).ok().map_or(d, |s| s.parse().unwrap()) }
+
+/// Exchanges Gaussians; gives how many have moved.
+pub fn teleport(descent: &mut Descent, rule: Rule) -> usize {
+    match rule {
+        Rule::Single => single(descent, None),
+        Rule::Batch => batch(descent),
+    }
+}
+
+/// Moves the Gaussian of least integral to `voxel`, or else to the voxel of the largest error.
+pub fn single(descent: &mut Descent, voxel: Option<usize>) -> usize {
+    let integral = |g: &[f64]| g[4] * g[3].powi(3);
+    let gaussians = descent.x.chunks(VARIABLES).enumerate();
+    let least = gaussians.min_by(|a, b| integral(a.1).total_cmp(&integral(b.1))).map(|(i, _)| i);
+    let Some(least) = least else { return 0 };
+    let (mut at, mut error) = (voxel.unwrap_or(0), f32::MIN);
+    descent.objective().errors(&descent.x).visit(|v, e, _| {
+        if voxel.map_or(-e > error, |voxel| v == voxel) {
+            (at, error) = (v, -e);
+        }
+    });
+    let [cx, cy, cz] = descent.objective().position(at);
+    let mut x = descent.x.clone();
+    let new = [cx, cy, cz, SINGLE_RADIUS, f64::from(error).clamp(WEIGHTS[0], WEIGHTS[1])];
+    x[least * VARIABLES..(least + 1) * VARIABLES].copy_from_slice(&new);
+    usize::from(descent.try_move(x, &[least]))
+}
+
+/// A place for a Gaussian: its variables and its gain.
+struct Candidate {
+    gaussian: [f64; VARIABLES],
+    gain: f64,
+}
+
+fn batch(descent: &mut Descent) -> usize {
+    let objective = descent.objective();
+    let errors = objective.errors(&descent.x);
+    let n = descent.x.len() / VARIABLES;
+    let most = ((n as f64 * env("SHARE", 0.05)) as usize).max(1);
+    let mean = descent.x.chunks(VARIABLES).map(|g| g[3]).sum::<f64>() / n as f64;
+    // Missing density in cells of about a mean radius.
+    let lattice = objective.lattice();
+    let edge = ((env("CELL", 1.0) * mean / lattice.space.scale).round() as usize).max(1);
+    let cells = lattice.dims.map(|d| d.div_ceil(edge));
+    let mut missing = vec![[0.0f64; 4]; cells.iter().product()];
+    let [nx, ny, _] = lattice.dims;
+    errors.visit(|v, e, _| {
+        if e < 0.0 {
+            let [i, j, k] = [v % nx, v / nx % ny, v / (nx * ny)];
+            let sums = &mut missing[i / edge + cells[0] * (j / edge + cells[1] * (k / edge))];
+            let m = f64::from(-e);
+            [1.0, i as f64, j as f64, k as f64].iter().zip(sums).for_each(|(f, s)| *s += f * m);
+        }
+    });
+    let mut order: Vec<usize> = (0..missing.len()).filter(|&c| missing[c][0] > 0.0).collect();
+    order.sort_by(|&a, &b| missing[b][0].total_cmp(&missing[a][0]).then(a.cmp(&b)));
+    order.truncate(8 * most);
+    let mut candidates: Vec<Candidate> = order.iter().filter_map(|&c| {
+        let [m, local @ ..] = missing[c];
+        let center: [f64; 3] = std::array::from_fn(|a| {
+            lattice.space.offset[a] + lattice.space.scale * (f64::from(lattice.origin[a]) + local[a] / m)
+        });
+        let tries = [0.4, 0.6, 0.9].map(|f| {
+            let radius = (f * mean).clamp(RADII[0], RADII[1]);
+            let (weight, gain) = errors.gain(center, radius);
+            Candidate { gaussian: [center[0], center[1], center[2], radius, weight.min(WEIGHTS[1])], gain }
+        });
+        tries.into_iter().max_by(|a, b| a.gain.total_cmp(&b.gain)).filter(|c| c.gaussian[4] >= WEIGHTS[0])
+    }).collect();
+    candidates.sort_by(|a, b| b.gain.total_cmp(&a.gain));
+    let loss = |i: usize| errors.loss(descent.x[i * VARIABLES + 3], descent.x[i * VARIABLES + 4]);
+    let mut worst: Vec<usize> = (0..n).collect();
+    worst.sort_by(|&a, &b| loss(a).total_cmp(&loss(b)).then(a.cmp(&b)));
+    let mut moves: Vec<(usize, [f64; VARIABLES])> = Vec::new();
+    for candidate in candidates {
+        let Some(&least) = worst.get(moves.len()) else { break };
+        if moves.len() >= most || candidate.gain < env("MARGIN", 2.0) * loss(least) {
+            break;
+        }
+        let g = candidate.gaussian;
+        // Two new Gaussians on the same missing density would count it twice.
+        let apart = |other: &[f64; VARIABLES]| {
+            let square: f64 = (0..3).map(|a| (g[a] - other[a]).powi(2)).sum();
+            square > (1.5 * g[3].max(other[3])).powi(2)
+        };
+        if moves.iter().all(|(_, other)| apart(other)) {
+            moves.push((least, g));
+        }
+    }
+    while !moves.is_empty() {
+        let mut x = descent.x.clone();
+        moves.iter().for_each(|(i, g)| x[i * VARIABLES..(i + 1) * VARIABLES].copy_from_slice(g));
+        let moved: Vec<usize> = moves.iter().map(|m| m.0).collect();
+        if descent.try_move(x, &moved) {
+            break;
+        }
+        moves.truncate(moves.len() / 2);
+    }
+    moves.len()
+}
