@@ -119,6 +119,30 @@ impl<'a> Descent<'a> {
         true
     }
 
+    /// Adds Gaussians, if that lowers the cost; tells whether it did. Costs one evaluation.
+    pub fn try_insert(&mut self, gaussians: &[[f64; VARIABLES]]) -> bool {
+        let mut x = self.x.clone();
+        x.extend(gaussians.as_flattened());
+        let mut gradient = vec![0.0; x.len()];
+        let cost = self.objective.cost_gradient(&x, &mut gradient);
+        self.extra += 1;
+        if !(cost < self.cost) {
+            return false;
+        }
+        (self.x, self.gradient, self.cost, self.finished) = (x, gradient, cost, false);
+        let units = natural_units(gaussians.as_flattened(), self.objective);
+        let (lower, upper) = bounds(&units);
+        self.units.extend(units);
+        self.solver.append(&lower, &upper);
+        true
+    }
+
+    /// Allows `evaluations` more.
+    pub fn allow(&mut self, evaluations: usize) {
+        self.solver.allow(self.solver.evaluations() + evaluations);
+        self.finished = false;
+    }
+
     /// Measures the variables in the units that are natural where they are now; the memory is carried over.
     pub fn rescale(&mut self) {
         let old = std::mem::replace(&mut self.units, natural_units(&self.x, self.objective));

@@ -11,7 +11,8 @@
 //! is undone. Cost: a forward pass, three moments a candidate, and one evaluation.
 
 use super::descent::{Descent, RADII, WEIGHTS};
-use super::objective::VARIABLES;
+use super::objective::{ErrorField, VARIABLES};
+use rayon::prelude::*;
 
 /// Which Gaussians move where.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
@@ -26,10 +27,18 @@ pub enum Rule {
 /// Radius of a Gaussian that the paper's rule moves.
 const SINGLE_RADIUS: f64 = 0.03;
 
-fn env(k: &str, d: f64) -> f64 { std::env::var(k).ok().map_or(d, |s| s.parse().unwrap()) }
+/// At most this share of the Gaussians moves at once.
+const SHARE: f64 = 0.05;
+/// The expected gain must be this many times the expected loss. The loss is an upper bound (neighbours take over).
+const MARGIN: f64 = 1.0;
+/// Candidate radii over the mean radius.
+const CANDIDATE_RADII: [f64; 3] = [0.4, 0.6, 0.9];
 
 /// Exchanges Gaussians; gives how many have moved.
 pub fn teleport(descent: &mut Descent, rule: Rule) -> usize {
+    if descent.x.is_empty() {
+        return 0;
+    }
     match rule {
         Rule::Single => single(descent, None),
         Rule::Batch => batch(descent),
@@ -55,21 +64,21 @@ pub fn single(descent: &mut Descent, voxel: Option<usize>) -> usize {
     usize::from(descent.try_move(x, &[least]))
 }
 
-/// A place for a Gaussian: its variables and its gain.
-struct Candidate {
-    gaussian: [f64; VARIABLES],
-    gain: f64,
+/// A place for a Gaussian: its variables and by how much it would lower the objective.
+pub struct Candidate {
+    /// Centre, radius, weight.
+    pub gaussian: [f64; VARIABLES],
+    /// See [`ErrorField::gain`].
+    pub gain: f64,
 }
 
-fn batch(descent: &mut Descent) -> usize {
-    let objective = descent.objective();
-    let errors = objective.errors(&descent.x);
+/// Up to `most` places for new Gaussians, well apart, the best first.
+pub fn places(descent: &Descent, errors: &ErrorField, most: usize) -> Vec<Candidate> {
+    let lattice = descent.objective().lattice();
     let n = descent.x.len() / VARIABLES;
-    let most = ((n as f64 * env("SHARE", 0.05)) as usize).max(1);
-    let mean = descent.x.chunks(VARIABLES).map(|g| g[3]).sum::<f64>() / n as f64;
-    // Missing density in cells of about a mean radius.
-    let lattice = objective.lattice();
-    let edge = ((env("CELL", 1.0) * mean / lattice.space.scale).round() as usize).max(1);
+    let mean = descent.x.chunks(VARIABLES).map(|g| g[3]).sum::<f64>() / n.max(1) as f64;
+    // Missing density, and its first moments, in cells of a mean radius.
+    let edge = ((mean / lattice.space.scale).round() as usize).max(1);
     let cells = lattice.dims.map(|d| d.div_ceil(edge));
     let mut missing = vec![[0.0f64; 4]; cells.iter().product()];
     let [nx, ny, _] = lattice.dims;
@@ -84,38 +93,45 @@ fn batch(descent: &mut Descent) -> usize {
     let mut order: Vec<usize> = (0..missing.len()).filter(|&c| missing[c][0] > 0.0).collect();
     order.sort_by(|&a, &b| missing[b][0].total_cmp(&missing[a][0]).then(a.cmp(&b)));
     order.truncate(8 * most);
-    let mut candidates: Vec<Candidate> = order.iter().filter_map(|&c| {
-        let [m, local @ ..] = missing[c];
+    let best_at = |&cell: &usize| {
+        let [m, local @ ..] = missing[cell];
         let center: [f64; 3] = std::array::from_fn(|a| {
             lattice.space.offset[a] + lattice.space.scale * (f64::from(lattice.origin[a]) + local[a] / m)
         });
-        let tries = [0.4, 0.6, 0.9].map(|f| {
+        let tries = CANDIDATE_RADII.map(|f| {
             let radius = (f * mean).clamp(RADII[0], RADII[1]);
             let (weight, gain) = errors.gain(center, radius);
             Candidate { gaussian: [center[0], center[1], center[2], radius, weight.min(WEIGHTS[1])], gain }
         });
         tries.into_iter().max_by(|a, b| a.gain.total_cmp(&b.gain)).filter(|c| c.gaussian[4] >= WEIGHTS[0])
-    }).collect();
+    };
+    let mut candidates: Vec<Candidate> = order.par_iter().filter_map(best_at).collect();
     candidates.sort_by(|a, b| b.gain.total_cmp(&a.gain));
+    let mut chosen: Vec<Candidate> = Vec::new();
+    for candidate in candidates {
+        let g = candidate.gaussian;
+        // Two new Gaussians on the same missing density would count it twice.
+        let apart = |other: &Candidate| {
+            let square: f64 = (0..3).map(|a| (g[a] - other.gaussian[a]).powi(2)).sum();
+            square > (1.5 * g[3].max(other.gaussian[3])).powi(2)
+        };
+        if chosen.len() < most && chosen.iter().all(apart) {
+            chosen.push(candidate);
+        }
+    }
+    chosen
+}
+
+fn batch(descent: &mut Descent) -> usize {
+    let n = descent.x.len() / VARIABLES;
+    let errors = descent.objective().errors(&descent.x);
+    let places = places(descent, &errors, ((n as f64 * SHARE) as usize).max(1));
     let loss = |i: usize| errors.loss(descent.x[i * VARIABLES + 3], descent.x[i * VARIABLES + 4]);
     let mut worst: Vec<usize> = (0..n).collect();
     worst.sort_by(|&a, &b| loss(a).total_cmp(&loss(b)).then(a.cmp(&b)));
-    let mut moves: Vec<(usize, [f64; VARIABLES])> = Vec::new();
-    for candidate in candidates {
-        let Some(&least) = worst.get(moves.len()) else { break };
-        if moves.len() >= most || candidate.gain < env("MARGIN", 2.0) * loss(least) {
-            break;
-        }
-        let g = candidate.gaussian;
-        // Two new Gaussians on the same missing density would count it twice.
-        let apart = |other: &[f64; VARIABLES]| {
-            let square: f64 = (0..3).map(|a| (g[a] - other[a]).powi(2)).sum();
-            square > (1.5 * g[3].max(other[3])).powi(2)
-        };
-        if moves.iter().all(|(_, other)| apart(other)) {
-            moves.push((least, g));
-        }
-    }
+    let pairs = worst.into_iter().zip(places);
+    let mut moves: Vec<(usize, [f64; VARIABLES])> =
+        pairs.take_while(|(i, place)| place.gain >= MARGIN * loss(*i)).map(|(i, place)| (i, place.gaussian)).collect();
     while !moves.is_empty() {
         let mut x = descent.x.clone();
         moves.iter().for_each(|(i, g)| x[i * VARIABLES..(i + 1) * VARIABLES].copy_from_slice(g));

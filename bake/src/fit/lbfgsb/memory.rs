@@ -78,7 +78,7 @@ impl Memory {
     }
 
     /// Changes every pair (variables rescaled, or forgotten) and makes the products again, at `3 m^2 n`.
-    pub fn transform(&mut self, change: impl Fn(&mut [f64], &mut [f64])) {
+    pub fn transform(&mut self, change: impl Fn(&mut Vec<f64>, &mut Vec<f64>)) {
         let (s, y) = (std::mem::take(&mut self.s), std::mem::take(&mut self.y));
         self.clear();
         for (mut s, mut y) in s.into_iter().zip(y) {

@@ -132,6 +132,23 @@ impl Lbfgsb {
         self.finished = None;
     }
 
+    /// Adds variables at the end, of which the memory knows nothing.
+    pub fn append(&mut self, lower: &[f64], upper: &[f64]) {
+        self.lower.extend(lower);
+        self.upper.extend(upper);
+        let n = self.lower.len();
+        self.memory.transform(|s, y| {
+            s.resize(n, 0.0);
+            y.resize(n, 0.0);
+        });
+        self.finished = None;
+    }
+
+    /// Allows `evaluations` in all from now on.
+    pub fn allow(&mut self, evaluations: usize) {
+        self.max_evaluations = evaluations;
+    }
+
     fn evaluate<O: CostGradient>(&mut self, problem: &mut Problem<O>, x: &[f64], g: &mut [f64]) -> Result<f64, Error> {
         self.evaluations += 1;
         problem.problem("cost_gradient_count", |o| Ok(o.cost_gradient(x, g)))
