@@ -15,7 +15,7 @@ fn main() {
     let space = UnitSpace::of_box(lo, std::array::from_fn(|a| (hi[a] - lo[a]) as u32));
     let d = FitSettings::default();
     let settings = FitSettings { gaussians: env("N", 600.) as usize, first_evaluations: env("EV", 200.) as usize, next_evaluations: env("NEV", 40.) as usize, memory: env("M", 20.) as usize,
-        error_ratio: env("RHO", 1.1), scope: if env("SUP", 0.) > 0. { Scope::Support } else { Scope::Box }, deletions: env("DEL", 3.) as usize, teleport_every: env("TE", 20.) as u64, ..d };
+        error_ratio: env("RHO", 1.1), scope: if env("SUP", 0.) > 0. { Scope::Support } else { Scope::Box }, deletions: env("DEL", 3.) as usize, teleport_every: env("TE", 20.) as u64, steady: env("ST", 1.) > 0., ..d };
     let (mut previous, mut first): (Vec<_>, f64) = (Vec::new(), 0.0);
     let start = std::time::Instant::now();
     let (mut sum, mut worst, mut sup) = (0.0, 0.0f64, 0.0);

@@ -45,8 +45,31 @@ pub fn teleport(descent: &mut Descent, rule: Rule) -> usize {
     }
 }
 
+/// The paper's rule once the optimiser has converged: the voxel of the largest error, and if that fails a random voxel
+/// that holds density. `draw` numbers the attempts, and decides the voxel. Gives how many have moved, 0 if both fail.
+pub fn at_rest(descent: &mut Descent, draw: u64) -> usize {
+    if descent.x.is_empty() {
+        return 0;
+    }
+    let mut occupied = Vec::new();
+    descent.objective().errors(&descent.x).visit(|v, _, d| {
+        if d > 0.0 {
+            occupied.push(v);
+        }
+    });
+    // A hash of the draw (Steele, Lea, Flood 2014, SplitMix64): the same voxels in every run.
+    let mut h = draw.wrapping_add(1).wrapping_mul(0x9E37_79B9_7F4A_7C15);
+    h = (h ^ (h >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+    h = (h ^ (h >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+    let random = occupied[((h ^ (h >> 31)) % occupied.len() as u64) as usize];
+    match single(descent, None) {
+        0 => single(descent, Some(random)),
+        moved => moved,
+    }
+}
+
 /// Moves the Gaussian of least integral to `voxel`, or else to the voxel of the largest error.
-pub fn single(descent: &mut Descent, voxel: Option<usize>) -> usize {
+fn single(descent: &mut Descent, voxel: Option<usize>) -> usize {
     let integral = |g: &[f64]| g[4] * g[3].powi(3);
     let gaussians = descent.x.chunks(VARIABLES).enumerate();
     let least = gaussians.min_by(|a, b| integral(a.1).total_cmp(&integral(b.1))).map(|(i, _)| i);
