@@ -2,3 +2,4 @@
 
 pub mod field;
 pub mod gaussian_points;
+pub mod gaussian_sum;
