@@ -4,9 +4,11 @@
 //! bytes that are there before anything is allocated, and an error names the file, the field, what was found and what
 //! was expected.
 
+pub mod atomic;
 pub mod bounded;
 pub mod error;
 pub mod gaussian;
+pub mod pack;
 pub mod residual;
 pub mod volume;
 
