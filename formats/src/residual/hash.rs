@@ -192,12 +192,15 @@ fn push_brick(brick: &Brick, stream: &mut Vec<u32>) {
     stream.extend(domain);
 }
 
-/// The number of slots, if the sides can be those of a table with `keys` codes.
-fn check_sides(path: &Path, side: u32, offset_side: u32, keys: u64) -> Result<usize> {
+/// The number of slots, at most 16 for each code plus 2^18, if the sides can be those of a table with `keys` codes.
+pub(crate) fn check_sides(path: &Path, side: u32, offset_side: u32, keys: u64) -> Result<usize> {
     let none = keys == 0 && side == 0 && offset_side == 0;
     let some = keys > 0 && (1..=MAX_SIDE).contains(&side) && (1..=MAX_SIDE).contains(&offset_side);
-    let slots = u64::from(side).pow(3);
-    if !(none || some && keys <= slots) {
+    let cube = |side: u32| u64::from(side).pow(3);
+    // A search ends well below this; a file that claims more would cost memory that its codes do not need.
+    let most = keys.saturating_mul(16).saturating_add(1 << 18);
+    let slots = if some { cube(side) } else { 0 };
+    if !(none || some && keys <= slots && slots.max(cube(offset_side)) <= most) {
         let found = format!("{side}^3 slots and {offset_side}^3 offsets");
         return Err(Error::invalid(path, "hash.sides", found, format!("a table for {keys} codes")));
     }
@@ -209,6 +212,7 @@ fn check_sides(path: &Path, side: u32, offset_side: u32, keys: u64) -> Result<us
 struct Frame {
     origin: [i32; 3],
     dims: [u32; 3],
+    active: u64,
     bricks: [u32; 3],
     start: [u32; 3],
     /// Words, counted from the start of the bytes.
@@ -286,6 +290,7 @@ impl<B: AsRef<[u8]>> HashView<B> {
             let frame = Frame {
                 origin,
                 dims,
+                active,
                 bricks,
                 start: frame_start(number, spaced),
                 table: table_at,
@@ -316,6 +321,11 @@ impl<B: AsRef<[u8]>> HashView<B> {
     /// Origin and dims of the box of `frame < frames()`.
     pub fn frame_box(&self, frame: usize) -> ([i32; 3], [u32; 3]) {
         (self.frames[frame].origin, self.frames[frame].dims)
+    }
+
+    /// Voxels of the support of `frame < frames()`.
+    pub fn active_voxels(&self, frame: usize) -> u64 {
+        self.frames[frame].active
     }
 
     /// The hash function.
@@ -494,7 +504,8 @@ pub(crate) mod tests {
     /// A hash that needs no search: a table as wide as the domain, and no offsets.
     pub(crate) fn trivial(frames: &[ResidualCodes]) -> HashTable {
         let spacing = spacing(frames.iter().map(|f| f.dims));
-        let side = 3 * spacing.iter().max().copied().unwrap_or(0);
+        let across = if frames.len() > 1 { 3 } else { 1 };
+        let side = across * spacing.iter().max().copied().unwrap_or(0);
         match frames.iter().any(|f| f.codes.iter().any(|&c| c != 0)) {
             true => HashTable { side, offset_side: 1, offsets: vec![0; 3] },
             false => HashTable::default(),
@@ -546,49 +557,17 @@ pub(crate) mod tests {
     }
 
     #[test]
+    #[rustfmt::skip]
     fn one_voxel_has_golden_bytes() {
         let mut support = crate::volume::VoxelMask::new(2);
         support.set(1);
         let frame = ResidualCodes { origin: [7, 0, -1], dims: [2, 1, 1], support, codes: vec![-300] };
         let table = HashTable { side: 1, offset_side: 1, offsets: vec![9, 9, 9] };
         let words: [i32; 37] = [
-            1,
-            1,
-            1,
-            1,
-            2,
-            3,
-            3,
-            3,
-            1,
-            0,
-            0,
-            0,
-            0,
-            0,
-            0,
-            0, // frames, m, r, step, bytes a slot, spacing, 1 code
-            7,
-            0,
-            -1,
-            2,
-            1,
-            1,
-            1,
-            0,
-            1,
-            0,
-            136,
-            0,
-            3,
-            0,
-            0,
-            0, // origin, dims, 1 voxel, 1 code, from byte 136, 3 words
-            0x0009_0909,
-            0xfed4, // offsets, slot
-            0,
-            1,
-            2, // table; brick: cell 0; its support (low half)
+            1, 1, 1, 1, 2, 3, 3, 3, 1, 0, 0, 0, 0, 0, 0, 0, // frames, m, r, step, bytes a slot, spacing, 1 code
+            7, 0, -1, 2, 1, 1, 1, 0, 1, 0, 136, 0, 3, 0, 0, 0, // origin, dims, 1 voxel, 1 code, from byte 136, 3 words
+            0x0009_0909, 0xfed4, // offsets, slot
+            0, 1, 2, // table; brick: cell 0; its support (low half)
         ];
         let mut expected: Vec<u8> = words.iter().flat_map(|w| w.to_le_bytes()).collect();
         expected.extend([0; 4]);

@@ -109,6 +109,14 @@ impl<B: AsRef<[u8]>> Residual<B> {
         }
     }
 
+    /// Voxels of the support of `frame < frames()`.
+    pub fn active_voxels(&self, frame: usize) -> u64 {
+        match self {
+            Self::Rank(view) => view.active_voxels(),
+            Self::Hash(view) => view.active_voxels(frame),
+        }
+    }
+
     /// The code of a voxel of `frame < frames()`, by its place in the frame's box; none outside the support or the box.
     #[inline]
     pub fn code(&self, frame: usize, voxel: [u32; 3]) -> Option<i32> {

@@ -362,36 +362,19 @@ mod tests {
     }
 
     #[test]
+    #[rustfmt::skip]
     fn a_brick_of_known_codes_has_golden_bytes() {
         let mut support = crate::volume::VoxelMask::new(8);
         [0, 3, 7].iter().for_each(|&v| support.set(v));
         let frame = ResidualCodes { origin: [1, -1, 0], dims: [8, 1, 1], support, codes: vec![-2, 3, 9] };
         let words: [i32; 25] = [
-            1,
-            -1,
-            0,
-            8,
-            1,
-            1,
-            3,
-            0,
-            11,
-            0,
-            0,
-            0,
-            0,
-            0,
-            0,
-            0,                 // header: origin, dims, 3 voxels, 11 words
-            0,                 // table: brick 0 at word 0
-            0b11,              // cells 0 and 1, none full, no shift
-            -2,                // smallest code
-            3,                 // cell 0: 3 bits from bit 0, base -2
+            1, -1, 0, 8, 1, 1, 3, 0, 10, 0, 0, 0, 0, 0, 0, 0, // header: origin, dims, 3 voxels, 10 words
+            0, // table: brick 0 at word 0
+            0b11, // cells 0 and 1, none full, no shift
+            -2, // smallest code
+            3, // cell 0: 3 bits from bit 0, base -2
             6 << 5 | 11 << 19, // cell 1: no bits, base -2 + 11
-            0b1001,
-            0,
-            0b1000,
-            0, // masks
+            0b1001, 0, 0b1000, 0, // masks
         ];
         let mut expected: Vec<u8> = words.iter().flat_map(|w| w.to_le_bytes()).collect();
         expected.extend([0b101_000, 0, 0, 0]); // values 0 and 5
