@@ -1,1 +1,3 @@
 //! A density sequence in, a pack out.
+
+pub mod residual;

@@ -41,7 +41,7 @@ pub const FRAME_BYTES: usize = 64;
 /// Smallest distance between two frames of a tile, so that frames of one voxel do not fall on each other's hash.
 pub const LEAST_SPACING: u32 = 3;
 /// Largest side of the table.
-const MAX_SIDE: u32 = 2048;
+pub const MAX_SIDE: u32 = 1024;
 
 /// The function of a perfect hash: what is searched for at bake time. No table at all is `side == 0`.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
