@@ -1,3 +1,4 @@
 //! A density sequence in, a pack out.
 
 pub mod fit;
+pub mod residual;

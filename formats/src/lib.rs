@@ -10,6 +10,7 @@ pub mod error;
 pub mod gaussian;
 pub mod image;
 pub mod mitsuba_vol;
+pub mod pack;
 pub mod pbrt;
 pub mod residual;
 pub mod scene;

@@ -1,0 +1,195 @@
+//! A section's bytes, at rest in the file and resident in memory.
+//!
+//! A residual at rest is either its resident bytes (plain or deflated) or the coded codes of its frames. From codes the
+//! resident layout is built again by the functions that built it first, so both ways give the same bytes. A tile of
+//! coded codes also keeps the function of its hash, which would be slow to find again:
+//!
+//! ```text
+//! frames u32 | m u32 | r u32 | deflated offsets: length u64 | each frame: length u64 | deflated offsets | coded frames
+//! ```
+
+use super::records::Codec;
+use crate::bounded::Bytes;
+use crate::residual::hash::{HashTable, HashView, MAX_FRAMES};
+use crate::residual::rank::RankView;
+use crate::residual::{Residual, ResidualCodes, coded, hash, rank};
+use crate::{Error, Result};
+use flate2::Compression;
+use flate2::bufread::{ZlibDecoder, ZlibEncoder};
+use std::io::Read;
+use std::path::Path;
+
+/// A zlib stream of `bytes`.
+pub fn deflate(bytes: &[u8]) -> Vec<u8> {
+    let mut packed = vec![];
+    let read = ZlibEncoder::new(bytes, Compression::default()).read_to_end(&mut packed);
+    assert!(read.is_ok(), "reading from memory cannot fail");
+    packed
+}
+
+/// The `expected` bytes of a zlib stream that fills all of `packed`. Memory grows with what is really there.
+pub fn inflate(path: &Path, what: &str, packed: &[u8], expected: u64) -> Result<Vec<u8>> {
+    let mut bytes = vec![];
+    let mut stream = ZlibDecoder::new(packed);
+    // One byte more than expected, so that a longer stream is noticed.
+    let read = stream.by_ref().take(expected.saturating_add(1)).read_to_end(&mut bytes);
+    if let Err(e) = read {
+        return Err(Error::invalid(path, what, format!("a damaged zlib stream ({e})"), "a whole one"));
+    }
+    if bytes.len() as u64 != expected {
+        return Err(Error::invalid(path, what, format!("{} bytes or more", bytes.len()), format!("{expected} bytes")));
+    }
+    match packed.len() as u64 - stream.total_in() {
+        0 => Ok(bytes),
+        extra => Err(Error::invalid(path, what, format!("{extra} bytes after the zlib stream"), "its end")),
+    }
+}
+
+/// A rank section at rest, and the number of its resident bytes.
+pub fn encode_rank(codes: &ResidualCodes, codec: Codec) -> (Vec<u8>, u64) {
+    let resident = rank::encode(codes);
+    let length = resident.len() as u64;
+    match codec {
+        Codec::Coded => (coded::encode(codes), length),
+        Codec::Deflate => (deflate(&resident), length),
+        Codec::Raw | Codec::Snapped => (resident, length),
+    }
+}
+
+/// The resident rank layout of a section at rest that claims `resident` bytes.
+pub fn decode_rank(path: &Path, bytes: Vec<u8>, codec: Codec, resident: u64) -> Result<Residual> {
+    let bytes = match codec {
+        Codec::Coded => rank::encode(&coded::decode(path, &bytes)?),
+        Codec::Deflate => inflate(path, "rank", &bytes, resident)?,
+        Codec::Raw | Codec::Snapped => bytes,
+    };
+    resident_length(path, "rank", &bytes, resident)?;
+    Ok(Residual::Rank(RankView::new(path, bytes)?))
+}
+
+/// A hash section at rest, and the number of its resident bytes. Fails if `table` is not a perfect hash of the codes.
+pub fn encode_hash(path: &Path, frames: &[ResidualCodes], table: &HashTable, codec: Codec) -> Result<(Vec<u8>, u64)> {
+    let resident = hash::assemble(path, frames, table)?;
+    let length = resident.len() as u64;
+    Ok(match codec {
+        Codec::Coded => {
+            let offsets = deflate(&table.offsets);
+            let coded: Vec<Vec<u8>> = frames.iter().map(coded::encode).collect();
+            let mut bytes = vec![];
+            for head in [frames.len() as u32, table.side, table.offset_side] {
+                bytes.extend(head.to_le_bytes());
+            }
+            std::iter::once(&offsets).chain(&coded).for_each(|b| bytes.extend((b.len() as u64).to_le_bytes()));
+            std::iter::once(&offsets).chain(&coded).for_each(|b| bytes.extend(b));
+            (bytes, length)
+        }
+        Codec::Deflate => (deflate(&resident), length),
+        Codec::Raw | Codec::Snapped => (resident, length),
+    })
+}
+
+/// The resident hash layout of a section at rest that claims `resident` bytes.
+pub fn decode_hash(path: &Path, bytes: Vec<u8>, codec: Codec, resident: u64) -> Result<Residual> {
+    let bytes = match codec {
+        Codec::Coded => assemble_coded(path, &bytes)?,
+        Codec::Deflate => inflate(path, "hash", &bytes, resident)?,
+        Codec::Raw | Codec::Snapped => bytes,
+    };
+    resident_length(path, "hash", &bytes, resident)?;
+    Ok(Residual::Hash(HashView::new(path, bytes)?))
+}
+
+fn assemble_coded(path: &Path, bytes: &[u8]) -> Result<Vec<u8>> {
+    let mut head = Bytes::new(path, bytes);
+    let frames = head.u32("hash.frames")? as usize;
+    if !(1..=MAX_FRAMES).contains(&frames) {
+        return Err(head.invalid("hash.frames", frames, format!("1 to {MAX_FRAMES}")));
+    }
+    let (side, offset_side) = (head.u32("hash.side")?, head.u32("hash.offset_side")?);
+    let lengths = (0..=frames).map(|_| head.u64("hash.lengths")).collect::<Result<Vec<u64>>>()?;
+    let mut next = |what: &str, length: u64| head.take(usize::try_from(length).unwrap_or(usize::MAX), what);
+    let packed = next("hash.offsets", lengths[0])?;
+    let mut codes = vec![];
+    for &length in &lengths[1..] {
+        codes.push(coded::decode(path, next("hash.coded", length)?)?);
+    }
+    head.finish("hash.coded")?;
+    // Only now is it known how large the tables may be.
+    let keys = codes.iter().flat_map(|f| &f.codes).filter(|&&c| c != 0).count();
+    hash::check_sides(path, side, offset_side, keys as u64)?;
+    let offsets = inflate(path, "hash.offsets", packed, 3 * u64::from(offset_side).pow(3))?;
+    hash::assemble(path, &codes, &HashTable { side, offset_side, offsets })
+}
+
+fn resident_length(path: &Path, what: &str, bytes: &[u8], expected: u64) -> Result<()> {
+    match bytes.len() as u64 == expected {
+        true => Ok(()),
+        false => Err(Error::invalid(path, format!("{what}.bytes_resident"), expected, bytes.len())),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::residual::hash::tests::trivial;
+    use crate::residual::tests::{ball, frames_of_every_kind};
+
+    const CODECS: [Codec; 3] = [Codec::Raw, Codec::Coded, Codec::Deflate];
+
+    #[test]
+    fn a_rank_section_is_resident_in_the_same_bytes_from_every_codec() {
+        let path = Path::new("p");
+        for frame in frames_of_every_kind() {
+            for codec in CODECS {
+                let (bytes, resident) = encode_rank(&frame, codec);
+                let back = decode_rank(path, bytes, codec, resident).unwrap();
+                assert_eq!(back.bytes(), rank::encode(&frame));
+                assert_eq!(back.codes(0).unwrap(), frame);
+            }
+        }
+    }
+
+    #[test]
+    fn a_hash_section_is_resident_in_the_same_bytes_from_every_codec() {
+        let path = Path::new("p");
+        let frames: Vec<_> = (0..5).map(|i| ball([9, 8, 7 + i], 60, u64::from(i))).collect();
+        let table = trivial(&frames);
+        for codec in CODECS {
+            let (bytes, resident) = encode_hash(path, &frames, &table, codec).unwrap();
+            let back = decode_hash(path, bytes, codec, resident).unwrap();
+            assert_eq!(back.bytes(), hash::assemble(path, &frames, &table).unwrap());
+            assert_eq!(back.codes(3).unwrap(), frames[3]);
+        }
+    }
+
+    #[test]
+    fn every_prefix_an_extra_byte_and_a_wrong_length_are_refused_by_every_codec() {
+        let path = Path::new("p");
+        let frames = [ball([9, 8, 7], 60, 1)];
+        let hash = |codec, bytes: &[u8], resident| decode_hash(path, bytes.to_vec(), codec, resident);
+        let rank = |codec, bytes: &[u8], resident| decode_rank(path, bytes.to_vec(), codec, resident);
+        type Decode<'a> = &'a dyn Fn(Codec, &[u8], u64) -> Result<Residual>;
+        for codec in CODECS {
+            let kinds: [(Decode, (Vec<u8>, u64)); 2] = [
+                (&rank, encode_rank(&frames[0], codec)),
+                (&hash, encode_hash(path, &frames, &trivial(&frames), codec).unwrap()),
+            ];
+            for (decode, (bytes, resident)) in kinds {
+                for length in (0..bytes.len()).step_by(3).chain([bytes.len() - 1]) {
+                    assert!(decode(codec, &bytes[..length], resident).is_err(), "{codec:?} {length}");
+                }
+                assert!(decode(codec, &[&bytes[..], &[0]].concat(), resident).is_err(), "{codec:?}");
+                assert!(decode(codec, &bytes, resident + 1).is_err());
+                assert!(decode(codec, &bytes, resident - 1).is_err());
+                assert!(decode(codec, &bytes, resident).is_ok());
+            }
+        }
+    }
+
+    #[test]
+    fn a_zlib_bomb_stops_at_the_length_that_was_claimed() {
+        let bomb = deflate(&vec![0; 10 << 20]);
+        let message = inflate(Path::new("p"), "x", &bomb, 100).unwrap_err().to_string();
+        assert_eq!(message, "p: x: found 101 bytes or more, expected 100 bytes");
+    }
+}

@@ -1,0 +1,25 @@
+//! The pack: one file that holds a baked sequence. `FORMAT.md` at the repository root states every offset.
+//!
+//! | file | what |
+//! |---|---|
+//! | [`container`] | header, sections on 256-byte boundaries, table of contents |
+//! | [`records`] | what is said about sequence, settings, frames and sections |
+//! | [`gaussians`] | Gaussians at rest: plain, or at 16 bits a parameter |
+//! | [`at_rest`] | a section's bytes at rest and resident |
+//! | [`writer`] | frames in, a file out |
+//! | [`reader`] | one frame out, without reading the others |
+//! | [`validate`] | the first thing that is wrong with a file |
+
+pub mod at_rest;
+pub mod container;
+pub mod gaussians;
+pub mod reader;
+pub mod records;
+mod validate;
+pub mod writer;
+
+pub use gaussians::snap_gaussians;
+pub use reader::{FrameResidual, Pack};
+pub use records::{Codec, FrameRecord, Promise, ResidualKind, SequenceRecord, SettingsRecord};
+pub use validate::{Finding, validate, validate_bytes};
+pub use writer::{AtRest, FrameData, PackWriter, write};

@@ -1,0 +1,203 @@
+//! Frames in, a pack out, one pass, with no more than one tile of frames in memory.
+//!
+//! The header is written last, over a blank one, so that an unfinished file is never mistaken for a pack; [`write`] adds
+//! a temporary file and a rename. The same input gives the same bytes: nothing here knows the time or the machine.
+
+use super::at_rest::{deflate, encode_hash, encode_rank};
+use super::container::{
+    ALIGNMENT, HEADER_BYTES, Header, KIND_FRAMES, KIND_GAUSSIANS, KIND_HASH, KIND_RANK, KIND_SEQUENCE, KIND_SETTINGS,
+};
+use super::gaussians::{self, GAUSSIAN_BYTES};
+use super::records::{Codec, FrameRecord, ResidualKind, SectionRecord, SequenceRecord, SettingsRecord, encode};
+use crate::gaussian::Gaussian;
+use crate::residual::ResidualCodes;
+use crate::residual::hash::{HashTable, MAX_FRAMES};
+use crate::{Error, Result};
+use std::io::{BufWriter, Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
+use xxhash_rust::xxh3::xxh3_64;
+
+/// One frame as it goes into a pack.
+#[derive(Clone, Debug)]
+pub struct FrameData<'a> {
+    /// What is known of it; the fields that [`FrameRecord`] says the writer fills in may hold anything.
+    pub record: FrameRecord,
+    /// Its Gaussians, in the order of the sum; for [`Codec::Snapped`] from [`super::snap_gaussians`].
+    pub gaussians: &'a [Gaussian],
+    /// Its residual.
+    pub codes: &'a ResidualCodes,
+}
+
+/// How sections lie in the file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct AtRest {
+    /// `Raw`, `Deflate` or `Snapped`.
+    pub gaussians: Codec,
+    /// `Raw`, `Deflate` or `Coded`.
+    pub residual: Codec,
+}
+
+impl AtRest {
+    /// The smallest file: Gaussians at 16 bits a parameter, coded residual.
+    pub const SMALLEST: Self = Self { gaussians: Codec::Snapped, residual: Codec::Coded };
+    /// Resident bytes as they are, to be uploaded without decoding.
+    pub const RAW: Self = Self { gaussians: Codec::Raw, residual: Codec::Raw };
+}
+
+/// Writes a pack as a whole or not at all: `fill` pushes the frames and ends with [`PackWriter::finish`].
+pub fn write(path: &Path, fill: impl FnOnce(PackWriter<&mut BufWriter<std::fs::File>>) -> Result<u64>) -> Result<u64> {
+    crate::atomic::write(path, |file| fill(PackWriter::new(path, file)?))
+}
+
+/// Writes one pack, frame after frame. Any error leaves it unfinished.
+#[derive(Debug)]
+pub struct PackWriter<W> {
+    out: W,
+    path: PathBuf,
+    position: u64,
+    toc: Vec<SectionRecord>,
+    frames: Vec<FrameRecord>,
+}
+
+impl<W: Write + Seek> PackWriter<W> {
+    /// A writer at the start of `out`; `path` is named in errors.
+    pub fn new(path: &Path, mut out: W) -> Result<Self> {
+        out.write_all(&[0; HEADER_BYTES as usize]).map_err(|e| Error::io(path, e))?;
+        Ok(Self { out, path: path.to_owned(), position: HEADER_BYTES, toc: vec![], frames: vec![] })
+    }
+
+    /// Frames pushed so far.
+    pub fn frames(&self) -> usize {
+        self.frames.len()
+    }
+
+    /// The next frame, its residual in the rank layout.
+    pub fn push_rank(&mut self, frame: &FrameData, at_rest: AtRest) -> Result<()> {
+        frame.codes.check(&self.path)?;
+        let number = self.frames.len() as u32;
+        let mut record = self.push_gaussians(number, frame, at_rest.gaussians)?;
+        let (bytes, resident) = encode_rank(frame.codes, at_rest.residual);
+        self.section(KIND_RANK, at_rest.residual, number..number + 1, &bytes, resident)?;
+        record.residual = ResidualKind::Rank;
+        record.rank_bytes = resident;
+        record.bytes_at_rest += bytes.len() as u64;
+        record.bytes_resident += resident;
+        self.frames.push(record);
+        Ok(())
+    }
+
+    /// The next 1 to 27 frames, their residuals in one perfect hash. Fails if `table` is not one for these codes.
+    pub fn push_tile(&mut self, tile: &[FrameData], table: &HashTable, at_rest: AtRest) -> Result<()> {
+        if tile.is_empty() || tile.len() > MAX_FRAMES {
+            let expected = format!("1 to {MAX_FRAMES}");
+            return Err(Error::invalid(&self.path, "hash.frames", tile.len(), expected));
+        }
+        let first = self.frames.len() as u32;
+        let mut records = vec![];
+        for (number, frame) in (first..).zip(tile) {
+            frame.codes.check(&self.path)?;
+            records.push(self.push_gaussians(number, frame, at_rest.gaussians)?);
+        }
+        let codes: Vec<ResidualCodes> = tile.iter().map(|f| f.codes.clone()).collect();
+        let (bytes, resident) = encode_hash(&self.path, &codes, table, at_rest.residual)?;
+        self.section(KIND_HASH, at_rest.residual, first..first + tile.len() as u32, &bytes, resident)?;
+        let share = |total: u64, i: usize| {
+            let (n, i) = (tile.len() as u64, i as u64);
+            total / n + u64::from(i < total % n)
+        };
+        for (i, mut record) in records.into_iter().enumerate() {
+            record.residual = ResidualKind::Hash;
+            record.hash_bytes = share(resident, i);
+            record.bytes_at_rest += share(bytes.len() as u64, i);
+            record.bytes_resident += share(resident, i);
+            self.frames.push(record);
+        }
+        Ok(())
+    }
+
+    /// Writes records, table of contents and header; gives the bytes of the file.
+    pub fn finish(mut self, sequence: &SequenceRecord, settings: &SettingsRecord) -> Result<u64> {
+        sequence.check(&self.path)?;
+        settings.check(&self.path)?;
+        for (number, frame) in self.frames.iter().enumerate() {
+            frame.check(&self.path, number, sequence)?;
+        }
+        let path = self.path.clone();
+        for (kind, bytes) in [
+            (KIND_SEQUENCE, encode(&path, "sequence", sequence)?),
+            (KIND_SETTINGS, encode(&path, "settings", settings)?),
+            (KIND_FRAMES, encode(&path, "frames", &self.frames)?),
+        ] {
+            let resident = bytes.len() as u64;
+            self.section(kind, Codec::Raw, 0..0, &bytes, resident)?;
+        }
+        let toc = encode(&path, "toc", &self.toc)?;
+        let header = Header {
+            file_bytes: self.position + toc.len() as u64,
+            toc_offset: self.position,
+            toc_bytes: toc.len() as u64,
+            toc_checksum: xxh3_64(&toc),
+            sections: self.toc.len() as u32,
+        };
+        let io = |e| Error::io(&path, e);
+        self.out.write_all(&toc).map_err(io)?;
+        self.out.seek(SeekFrom::Start(0)).map_err(io)?;
+        self.out.write_all(&header.encode()).map_err(io)?;
+        self.out.flush().map_err(io)?;
+        Ok(header.file_bytes)
+    }
+
+    /// Writes the Gaussians of a frame and starts its record.
+    fn push_gaussians(&mut self, number: u32, frame: &FrameData, codec: Codec) -> Result<FrameRecord> {
+        gaussians::check(&self.path, &format!("frames[{number}]"), frame.gaussians)?;
+        let plain: Vec<u8> = frame.gaussians.iter().flat_map(gaussians::to_bytes).collect();
+        let resident = plain.len() as u64;
+        debug_assert_eq!(resident as usize, frame.gaussians.len() * GAUSSIAN_BYTES);
+        let bytes = match codec {
+            Codec::Raw => plain,
+            Codec::Deflate => deflate(&plain),
+            Codec::Snapped => gaussians::encode(&self.path, frame.gaussians)?,
+            Codec::Coded => {
+                return Err(Error::invalid(&self.path, "gaussians.codec", "Coded", "Raw, Deflate, Snapped"));
+            }
+        };
+        self.section(KIND_GAUSSIANS, codec, number..number + 1, &bytes, resident)?;
+        Ok(FrameRecord {
+            origin: frame.codes.origin,
+            dims: frame.codes.dims,
+            active_voxels: frame.codes.codes.len() as u64,
+            gaussians: frame.gaussians.len() as u32,
+            bytes_at_rest: bytes.len() as u64,
+            bytes_resident: resident,
+            ..frame.record
+        })
+    }
+
+    fn section(
+        &mut self,
+        kind: u32,
+        codec: Codec,
+        frames: std::ops::Range<u32>,
+        bytes: &[u8],
+        resident: u64,
+    ) -> Result<()> {
+        let section = SectionRecord {
+            kind,
+            codec: codec as u32,
+            first_frame: frames.start,
+            frames: frames.end - frames.start,
+            offset: self.position,
+            bytes_at_rest: bytes.len() as u64,
+            bytes_resident: resident,
+            checksum: xxh3_64(bytes),
+        };
+        super::container::codec_of(&self.path, "section", &section)?;
+        let end = (self.position + bytes.len() as u64).next_multiple_of(ALIGNMENT);
+        let zeros = [0; ALIGNMENT as usize];
+        let padding = &zeros[..(end - self.position) as usize - bytes.len()];
+        self.out.write_all(bytes).and_then(|()| self.out.write_all(padding)).map_err(|e| Error::io(&self.path, e))?;
+        self.position = end;
+        self.toc.push(section);
+        Ok(())
+    }
+}
