@@ -1,5 +1,15 @@
 //! The quantised residual of one frame: what the Gaussians miss, as integer codes on the frame's support.
 
+mod code_model;
+pub mod coded;
+mod least_squares;
+mod logistic;
+mod mixing;
+mod predict;
+mod range_coder;
+mod support;
+mod sweep;
+
 use crate::volume::VoxelMask;
 
 /// The residual of one frame before any layout: `density = max(0, gaussian_sum + step * code)` on the support,
