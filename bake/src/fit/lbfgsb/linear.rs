@@ -108,6 +108,6 @@ mod tests {
     #[test]
     fn a_dot_product_covers_the_rest_after_the_blocks() {
         let a: Vec<f64> = (0..19).map(f64::from).collect();
-        assert_eq!(dot(&a, &a), (0..19).map(|i| f64::from(i * i)).sum());
+        assert_eq!(dot(&a, &a), (0..19).map(|i| f64::from(i * i)).sum::<f64>());
     }
 }
