@@ -109,3 +109,21 @@ fn a_reader_that_stops_early_is_no_failure() {
     let output = child.wait_with_output().unwrap();
     assert_eq!((output.status.code(), text(&output.stderr)), (Some(0), ""));
 }
+
+/// The first code block of the guide that starts with `start`.
+fn guide_block(start: &str) -> String {
+    let guide = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/guide.md")).unwrap();
+    let mut blocks = guide.split("```").skip(1).step_by(2).map(|b| b.split_once('\n').unwrap().1.to_owned());
+    blocks.find(|b| b.starts_with(start)).unwrap_or_else(|| panic!("no block of the guide starts with {start}"))
+}
+
+#[test]
+fn the_files_and_messages_of_the_guide_are_true() {
+    let scene = smoke_formats::scene::Scene::parse(Path::new("scene.toml"), &guide_block("[world]")).unwrap();
+    assert_eq!((scene.lights.len(), scene.width), (3, 800));
+    let settings = guide_block("# smoke-bake.toml").replace("mask-alpha = true", "");
+    assert_eq!(scale_used(&settings, &[], &[]), 0.05);
+    let folder = folder("[compare]\nscael = 2");
+    let output = smoke_bake(folder.path(), &["compare", "a.exr", "a.exr"], &[]);
+    assert_eq!(text(&output.stderr), guide_block("smoke-bake: "));
+}

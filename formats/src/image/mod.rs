@@ -200,4 +200,28 @@ mod tests {
         assert!(check_size(path, u64::MAX, 2, 1).is_err());
         assert!(check_size(path, 0, 2, 1).is_err());
     }
+
+    #[test]
+    #[ignore = "needs ../shared/data"]
+    fn the_environment_maps_and_references_of_the_shared_data_are_read() {
+        let data = std::env::var_os("SMOKE_BAKE_DATA")
+            .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data"), Into::into);
+        let images = |folder: std::path::PathBuf| {
+            let paths = std::fs::read_dir(&folder).unwrap().map(|e| e.unwrap().path());
+            let paths: Vec<_> = paths.filter(|p| p.extension().is_some_and(|e| e == "exr")).collect();
+            assert!(!paths.is_empty(), "{}", folder.display());
+            paths
+        };
+        for path in images(data.join("env")) {
+            let (map, negative) = read_environment(&path).unwrap();
+            assert_eq!(map.width, 2 * map.height, "{}", path.display());
+            // Lossy compression leaves a negative sample here and there, not a negative map.
+            assert!(negative * 100 < 3 * map.pixels.len(), "{negative} negative samples in {}", path.display());
+        }
+        for path in images(data.join("../peers/references")) {
+            let image = read(&path).unwrap().rgb(&path).unwrap();
+            assert_eq!((image.width, image.height), (320, 400));
+            assert!(image.pixels.iter().flatten().all(|v| v.is_finite() && *v >= 0.0), "{}", path.display());
+        }
+    }
 }

@@ -97,14 +97,13 @@ pub fn write_frame(
 
     let matrix = |m: &RowMatrix| std::array::from_fn(|i| m[i / 4][i % 4] as f32);
     let mut attributes = LayerAttributes {
-        software_name: Some(metadata.software.as_str().into()),
+        software_name: Some(latin1(path, "software", &metadata.software)?),
         frames_per_second: metadata.frames_per_second,
         world_to_camera: Some(matrix(&metadata.world_to_camera)),
         world_to_normalized_device: Some(matrix(&metadata.world_to_ndc)),
         ..LayerAttributes::default()
     };
-    let settings = Text::new_or_none(metadata.settings_json.as_str())
-        .ok_or_else(|| Error::invalid(path, SETTINGS_ATTRIBUTE, "text beyond Latin-1", "JSON with \\u escapes"))?;
+    let settings = latin1(path, SETTINGS_ATTRIBUTE, &ascii_json(&metadata.settings_json))?;
     attributes.other.insert(Text::from(SETTINGS_ATTRIBUTE), AttributeValue::Text(settings));
     save(path, [frame.width, frame.height], channels, attributes)?;
     Ok(clamped)
@@ -118,7 +117,7 @@ pub fn write_channels(path: &Path, image: &FloatImage) -> Result<()> {
             let what = format!("samples of {}", c.name);
             return Err(Error::invalid(path, what, c.values.len(), image.width * image.height));
         }
-        Ok(AnyChannel::new(c.name.as_str(), FlatSamples::F32(c.values.clone())))
+        Ok(AnyChannel::new(latin1(path, "channel name", &c.name)?, FlatSamples::F32(c.values.clone())))
     };
     let channels = image.channels.iter().map(channel).collect::<Result<_>>()?;
     save(path, [image.width, image.height], channels, LayerAttributes::default())
@@ -147,6 +146,24 @@ fn save(
             other => Error::invalid(path, "OpenEXR", other, "a writable image"),
         })
     })
+}
+
+/// Text as OpenEXR holds it, one byte a character.
+fn latin1(path: &Path, what: &str, text: &str) -> Result<Text> {
+    Text::new_or_none(text).ok_or_else(|| Error::invalid(path, what, format!("{text:?}"), "characters of Latin-1"))
+}
+
+/// JSON with every character beyond ASCII as `\u` escapes: the same document, readable by any EXR tool. Such
+/// characters stand only inside strings, where an escape is allowed.
+fn ascii_json(json: &str) -> String {
+    let mut out = String::with_capacity(json.len());
+    for c in json.chars() {
+        match c.is_ascii() {
+            true => out.push(c),
+            false => c.encode_utf16(&mut [0; 2]).iter().for_each(|unit| out.push_str(&format!("\\u{unit:04x}"))),
+        }
+    }
+    out
 }
 
 fn check_samples(path: &Path, name: &str, values: &[f32], width: usize, good: impl Fn(f32) -> bool) -> Result<()> {
@@ -263,5 +280,34 @@ mod tests {
         let bad = RenderedFrame { alpha: &ALPHA[..5], ..frame() };
         let message = write_frame(Path::new("a.exr"), &bad, &metadata(), SamplePrecision::Half).unwrap_err();
         assert_eq!(message.to_string(), "a.exr: samples of A: found 5, expected 6");
+    }
+
+    #[test]
+    fn settings_beyond_ascii_read_back_as_the_same_document() {
+        let json = r#"{"image":"Köln/夜🌫.exr"}"#;
+        let ascii = ascii_json(json);
+        assert!(ascii.is_ascii());
+        let value = |text: &str| serde_json::from_str::<serde_json::Value>(text).unwrap();
+        assert_eq!(value(&ascii), value(json));
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.exr");
+        let metadata = FrameMetadata { settings_json: json.into(), ..metadata() };
+        write_frame(&path, &frame(), &metadata, SamplePrecision::Half).unwrap();
+        let bad = FrameMetadata { software: "烟".into(), ..metadata };
+        assert!(write_frame(&path, &frame(), &bad, SamplePrecision::Half).is_err());
+    }
+
+    #[test]
+    fn channels_that_make_no_image_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.exr");
+        let image = |names: &[&str], length: usize| {
+            let channels = names.iter().map(|n| Channel { name: (*n).into(), values: vec![0.0; length] }).collect();
+            FloatImage { width: 2, height: 1, channels }
+        };
+        assert!(write_channels(&path, &image(&["R"], 2)).is_ok());
+        for bad in [image(&["R", "R"], 2), image(&[], 2), image(&["R"], 3), image(&["烟"], 2), image(&[""], 2)] {
+            assert!(write_channels(&path, &bad).is_err(), "{bad:?}");
+        }
     }
 }
