@@ -59,7 +59,12 @@ impl Sequence {
         }
         if !is_file {
             std::fs::metadata(path).map_err(|e| Error::io(path, e))?;
-            return Err(Error::invalid(path, "sequence", "a folder or a device", "a file, or a pattern such as plume.####.vdb"));
+            return Err(Error::invalid(
+                path,
+                "sequence",
+                "a folder or a device",
+                "a file, or a pattern such as plume.####.vdb",
+            ));
         }
         if let Some((name, number)) = NamePattern::from_member(&folder, file_name)? {
             let frames = name.frames(path)?;
@@ -133,7 +138,12 @@ impl NamePattern {
             return Ok(None);
         }
         let &[(start, end, width)] = found.as_slice() else {
-            return Err(Error::invalid(path, "sequence", format!("{} patterns", found.len()), "one, such as plume.####.vdb"));
+            return Err(Error::invalid(
+                path,
+                "sequence",
+                format!("{} patterns", found.len()),
+                "one, such as plume.####.vdb",
+            ));
         };
         let (prefix, suffix) = (name[..start].to_owned(), name[end..].to_owned());
         Ok(Some(Self { folder: folder.to_owned(), prefix, width, suffix }))
@@ -150,7 +160,8 @@ impl NamePattern {
         let mut pattern = Self { folder, prefix: prefix.to_owned(), width: 1, suffix };
         let padded = |d: &str| d.len() > 1 && d.starts_with('0');
         let siblings = pattern.names()?;
-        let any_padded = siblings.iter().filter_map(|n| pattern.digits(n)).any(|d| d.len() == digits.len() && padded(d));
+        let any_padded =
+            siblings.iter().filter_map(|n| pattern.digits(n)).any(|d| d.len() == digits.len() && padded(d));
         if padded(digits) || any_padded {
             pattern.width = digits.len();
         }
@@ -254,7 +265,8 @@ fn placeholders(name: &str) -> Vec<(usize, usize, usize)> {
 
 /// Start and end of the digits that number a file's frame.
 fn frame_digits(name: &str) -> Option<(usize, usize)> {
-    let stem = name.rfind('.').filter(|&dot| name[dot + 1..].bytes().any(|b| !b.is_ascii_digit())).unwrap_or(name.len());
+    let stem =
+        name.rfind('.').filter(|&dot| name[dot + 1..].bytes().any(|b| !b.is_ascii_digit())).unwrap_or(name.len());
     let bytes = &name.as_bytes()[..stem];
     let mut runs = Vec::new();
     let mut at = 0;
@@ -353,11 +365,29 @@ mod tests {
 
     #[test]
     fn every_pattern_and_every_member_finds_the_same_frames() {
-        let dir = folder(&["plume.0999.vdb", "plume.1000.vdb", "plume.1002.vdb", "plume.10000.vdb", "plume.-0001.vdb",
-                           "plume.7.vdb", "plume.01000.vdb", "plume.vdb", "plume.1000.vdb.bak", "other.1001.vdb"]);
+        let dir = folder(&[
+            "plume.0999.vdb",
+            "plume.1000.vdb",
+            "plume.1002.vdb",
+            "plume.10000.vdb",
+            "plume.-0001.vdb",
+            "plume.7.vdb",
+            "plume.01000.vdb",
+            "plume.vdb",
+            "plume.1000.vdb.bak",
+            "other.1001.vdb",
+        ]);
         std::fs::create_dir(dir.path().join("plume.1001.vdb")).unwrap();
-        for name in ["plume.####.vdb", "plume.#.vdb", "plume.@@@@.vdb", "plume.%04d.vdb", "plume.$F4.vdb", "plume.1002.vdb",
-                     "plume.0999.vdb", "plume.-0001.vdb"] {
+        for name in [
+            "plume.####.vdb",
+            "plume.#.vdb",
+            "plume.@@@@.vdb",
+            "plume.%04d.vdb",
+            "plume.$F4.vdb",
+            "plume.1002.vdb",
+            "plume.0999.vdb",
+            "plume.-0001.vdb",
+        ] {
             assert_eq!(numbers(&dir, name), [-1, 999, 1000, 1002, 10000], "{name}");
         }
         assert_eq!(numbers(&dir, "plume.%d.vdb"), [7, 1000, 1002, 10000]);

@@ -200,7 +200,9 @@ fn skip_content(bytes: &mut Bytes, grid: &Descriptor) -> Result<()> {
 
 /// The same error, naming the grid.
 fn in_grid(error: Error, grid: &str) -> Error {
-    let named = |what: String| if what.starts_with("grid '") { what } else { format!("grid '{}': {what}", grid.escape_debug()) };
+    let named = |what: String| {
+        if what.starts_with("grid '") { what } else { format!("grid '{}': {what}", grid.escape_debug()) }
+    };
     match error {
         Error::Invalid { path, what, found, expected } => Error::Invalid { path, what: named(what), found, expected },
         Error::Unsupported { path, what, found, hint } => Error::Unsupported { path, what: named(what), found, hint },

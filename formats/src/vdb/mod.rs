@@ -19,11 +19,11 @@ mod blosc;
 mod dense;
 mod directory;
 mod header;
+#[cfg(test)]
+mod tests;
 mod topology;
 mod transform;
 mod values;
-#[cfg(test)]
-mod tests;
 mod write;
 
 use crate::bounded::Bytes;

@@ -87,8 +87,7 @@ impl Coding {
             encoder.write_all(&bytes).unwrap();
             encoder.finish().unwrap()
         };
-        let (length, data) =
-            if self.plain { (-(bytes.len() as i64), bytes) } else { (packed.len() as i64, packed) };
+        let (length, data) = if self.plain { (-(bytes.len() as i64), bytes) } else { (packed.len() as i64, packed) };
         [&length.to_le_bytes()[..], &data].concat()
     }
 
@@ -147,7 +146,7 @@ fn sample(at: usize) -> f32 {
 
 #[test]
 fn every_node_code_under_every_compression_gives_the_values_of_the_table() {
-    let selected = |at: usize| at * 7 % 3 == 0;
+    let selected = |at: usize| (at * 7).is_multiple_of(3);
     let selection: Vec<u8> =
         (0..64).map(|b| (0..8).fold(0, |byte, i| byte | u8::from(selected(8 * b + i)) << i)).collect();
     for flags in 0..8 {
@@ -239,7 +238,8 @@ fn an_instance_shares_the_voxels_and_keeps_its_own_map() {
     let mut moved = words(&[0, 0]);
     text(&mut moved, "TranslationMap");
     moved.extend([1.0f64, 2.0, 3.0].iter().flat_map(|v| v.to_le_bytes()));
-    let instance = |name, parent| Part { name, parent, content: moved.clone(), topology: vec![], blocks: vec![], ..float.clone() };
+    let instance =
+        |name, parent| Part { name, parent, content: moved.clone(), topology: vec![], blocks: vec![], ..float.clone() };
     for has_offsets in [true, false] {
         let bytes = file(224, has_offsets, &[instance("copy", "density"), float.clone()]);
         let read = |name| read_bytes(Path::new("a.vdb"), &bytes, name).unwrap();
@@ -259,7 +259,7 @@ fn each_integrity_check_sees_the_defect_it_is_for() {
         let message = read_file(&file(224, true, &[part])).unwrap_err().to_string();
         assert!(message.starts_with("a.vdb: grid 'density': ") && message.contains(what), "{message}");
     };
-    read_file(&file(224, true, &[good.clone()])).unwrap();
+    read_file(&file(224, true, std::slice::from_ref(&good))).unwrap();
     let mut part = good.clone();
     part.blocks[3] ^= 1;
     refused(part, "mask of the leaf at [0, 0, 0]");
