@@ -8,7 +8,8 @@
 use crate::{Error, Result};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::str::FromStr;
+
+pub use crate::frame_selection::{FrameSelection, FrameSelectionError};
 
 /// One frame of a sequence.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -99,8 +100,8 @@ impl Sequence {
     /// The frames of a selection, ascending, each once. A frame asked for that is missing is an error naming it.
     pub fn select(&self, selection: &FrameSelection) -> Result<Vec<SequenceFrame>> {
         let mut chosen = BTreeMap::new();
-        for range in &selection.ranges {
-            for number in (range.first..=range.last).step_by(range.step as usize) {
+        for range in selection.ranges() {
+            for number in range.numbers() {
                 // The first missing frame ends it, so that a huge range costs no more than the frames that are there.
                 let Ok(at) = self.frames.binary_search_by_key(&number, |f| f.number) else {
                     let there = format!("{} to {}", self.frames[0].number, self.frames[self.frames.len() - 1].number);
@@ -282,72 +283,6 @@ fn frame_digits(name: &str) -> Option<(usize, usize)> {
     runs.iter().rfind(|r| set_off(r.0)).or(runs.last()).copied()
 }
 
-/// Which frames to take, such as `1001-1064`, `1001-1064x2`, `-3-5,10,20`.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct FrameSelection {
-    ranges: Vec<FrameRange>,
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct FrameRange {
-    first: i32,
-    last: i32,
-    step: u32,
-}
-
-/// Why a text is no frame selection.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("frames '{text}': {reason}")]
-pub struct FrameSelectionError {
-    text: String,
-    reason: String,
-}
-
-impl FromStr for FrameSelection {
-    type Err = FrameSelectionError;
-
-    fn from_str(text: &str) -> std::result::Result<Self, FrameSelectionError> {
-        let ranges = text.split(',').map(|item| range(item.trim()));
-        let ranges = ranges.collect::<std::result::Result<_, String>>();
-        let ranges = ranges.map_err(|reason| FrameSelectionError { text: text.escape_debug().to_string(), reason })?;
-        Ok(Self { ranges })
-    }
-}
-
-fn range(item: &str) -> std::result::Result<FrameRange, String> {
-    if item.contains(':') {
-        let hint = item.replacen(':', "x", 1);
-        return Err(format!("the step is written with x, such as {}", hint.escape_debug()));
-    }
-    let whole = |digits: &str, what: &str| {
-        let is_number = !digits.is_empty() && digits.bytes().all(|b| b.is_ascii_digit());
-        let number = is_number.then(|| digits.parse::<i64>().ok().filter(|&n| n <= i64::from(i32::MAX))).flatten();
-        number.ok_or_else(|| format!("'{}' where {what} was expected, such as in 1001-1064x2", digits.escape_debug()))
-    };
-    // A sign belongs to the number that follows it.
-    let signed = |text: &str| match text.strip_prefix('-') {
-        Some(digits) => whole(digits, "a frame").map(|n| -n as i32),
-        None => whole(text, "a frame").map(|n| n as i32),
-    };
-    let (frames, step) = match item.split_once('x') {
-        Some((frames, step)) => (frames, whole(step, "a step")? as u32),
-        None => (item, 1),
-    };
-    if step == 0 {
-        return Err("a step of 0 never ends; use 1 or more".to_owned());
-    }
-    let dash = frames.char_indices().skip(1).find(|&(_, c)| c == '-');
-    let (first, last) = match dash {
-        Some((at, _)) => (signed(&frames[..at])?, signed(&frames[at + 1..])?),
-        None if step == 1 => (signed(frames)?, signed(frames)?),
-        None => return Err("a step needs a first and a last frame, such as 1001-1064x2".to_owned()),
-    };
-    if last < first {
-        return Err(format!("{first}-{last} goes down; write {last}-{first}"));
-    }
-    Ok(FrameRange { first, last, step })
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -446,26 +381,6 @@ mod tests {
             assert!(message.contains("no such file") && message.contains("p."), "{message}");
         }
         assert!(select("1-4").unwrap_err().to_string().contains("p.0003.vdb: frame 3"));
-    }
-
-    #[test]
-    fn texts_that_are_no_selection_say_why() {
-        for (text, why) in [
-            ("1001-1064:2", "such as 1001-1064x2"),
-            ("", "'' where a frame"),
-            ("1,,2", "'' where a frame"),
-            ("5-1", "write 1-5"),
-            ("1-5x0", "step of 0"),
-            ("5x2", "a first and a last"),
-            ("1-5x", "'' where a step"),
-            ("1-+5", "'+5'"),
-            ("all", "'all'"),
-            ("99999999999", "99999999999"),
-            ("1\u{e9}-5", "where a frame"),
-        ] {
-            let message = text.parse::<FrameSelection>().unwrap_err().to_string();
-            assert!(message.contains(why), "{text}: {message}");
-        }
     }
 
     #[test]

@@ -189,7 +189,7 @@ fn every_node_code_under_every_compression_gives_the_values_of_the_table() {
 #[test]
 fn root_tiles_active_and_inactive_take_part_in_the_box_and_the_values() {
     let mut part = RAW.part(0.0, &MASK, [vec![6], RAW.block(&[1.0; 512])].concat());
-    // Seven of eight voxels of a 4096-wide tile lie beyond any box that may be made, so the tile must be refused.
+    // A root tile has 4096³ voxels, more than any box may: an active one is refused by the size of the box.
     part.topology = RAW.topology(0.0, &MASK, &[([4096, 0, 0], 2.0, true)]);
     let message = read_file(&file(224, true, &[part.clone()])).unwrap_err().to_string();
     assert!(message.contains("8192 x 4096 x 4096 voxels") && message.contains("grid 'density'"), "{message}");
@@ -293,7 +293,8 @@ fn each_integrity_check_sees_the_defect_it_is_for() {
 fn offsets_that_go_back_are_refused() {
     let good = RAW.part(0.0, &MASK, [vec![6], RAW.block(&[1.0; 512])].concat());
     let bytes = file(224, true, &[good.clone(), good]);
-    let offsets = 65 + 4 + 11 + 4 + 16 + 4 - 4;
+    // Head and counts, name, tree type, empty parent.
+    let offsets = 65 + (4 + 7) + (4 + 16) + 4;
     for (at, value) in [(0, 5i64), (8, 5), (16, 5), (16, -1), (16, i64::MAX)] {
         let mut bad = bytes.clone();
         bad[offsets + at..][..8].copy_from_slice(&value.to_le_bytes());
