@@ -16,7 +16,7 @@ use half::f16;
 use std::io::Write;
 use std::path::Path;
 
-/// How [`write`] stores the values.
+/// How [`write()`] stores the values.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct WriteOptions {
     /// As half floats, rounded to nearest: relative error at most 2^-11 from 6e-5 up to 65504, the largest.
