@@ -53,7 +53,10 @@ fn reseal_header(bytes: &mut [u8]) {
 
 #[test]
 fn every_single_bit_of_a_pack_is_vouched_for() {
-    let good = pack_bytes(&sample(), AtRest::SMALLEST);
+    // One frame in ranks, one in a hash: small, because each of its bits is flipped.
+    let mut sample = sample();
+    sample.frames.truncate(2);
+    let good = pack_bytes(&sample, AtRest::SMALLEST);
     assert_eq!(findings(&good), []);
     let mut bytes = good.clone();
     for bit in 0..8 * bytes.len() {
