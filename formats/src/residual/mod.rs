@@ -2,11 +2,13 @@
 
 mod code_model;
 pub mod coded;
+mod earlier;
 mod least_squares;
 mod logistic;
 mod mixing;
 mod predict;
 mod range_coder;
+mod ranks;
 mod support;
 mod sweep;
 
