@@ -25,8 +25,8 @@
 //! of the sweep hold at most `voxels^(2/3)` voxels. A stream that ends early is noticed within one row.
 //!
 //! # Cost
-//! About 0.8 us a code to encode or decode, 1.1 us after an earlier frame (`docs/residual-codec.md` has the table);
-//! 4.2 to 3.6 bits a voxel of a rough plume at max error 0.002, 2.5 to 2.0 at 0.01, and a seventh less after the frame
+//! About 0.6 us a code to encode or decode, 0.9 us after an earlier frame (`docs/residual-codec.md` has the table);
+//! 4.2 to 3.6 bits a voxel of a rough plume at max error 0.002, 2.5 to 2.0 at 0.01, and a sixth less after the frame
 //! before. Support included; SZ3 takes 6.4 to 5.6 and 4.0 to 3.3.
 
 use super::ResidualCodes;
@@ -56,7 +56,7 @@ pub fn encode(residual: &ResidualCodes) -> Vec<u8> {
     encode_frame(residual, None)
 }
 
-/// Encodes a frame that needs `previous` to be read: about 14 % smaller than [`encode`] if that is the frame before.
+/// Encodes a frame that needs `previous` to be read: 13 to 25 % smaller than [`encode`] if that is the frame before.
 ///
 /// # Panics
 /// As [`encode`], for either frame.
