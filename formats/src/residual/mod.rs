@@ -15,12 +15,14 @@ pub mod brick;
 mod code_model;
 pub mod coded;
 pub mod hash;
+mod earlier;
 mod least_squares;
 mod logistic;
 mod mixing;
 mod predict;
 mod range_coder;
 pub mod rank;
+mod ranks;
 mod support;
 mod sweep;
 
