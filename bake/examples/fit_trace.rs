@@ -60,7 +60,8 @@ fn function(name: &str, n: usize, evaluations: usize) -> Result<Vec<(usize, f64)
         trace.push((result.solver.evaluations(), result.state.cost));
         let done = result.state.iter == 0 || result.solver.evaluations() >= evaluations;
         let lost = || Failure::from("the state lost its point");
-        at = (result.state.take_param().ok_or_else(lost)?, result.state.take_gradient().map(|g| (g, result.state.cost)));
+        at =
+            (result.state.take_param().ok_or_else(lost)?, result.state.take_gradient().map(|g| (g, result.state.cost)));
         solver = result.solver;
         if done {
             return Ok(trace);

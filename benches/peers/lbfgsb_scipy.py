@@ -71,7 +71,8 @@ def evaluate(x, density, h, energy):
                     m3 += s * a0 * uz
                     m4 += s * (a2 + a0 * (uy * uy + uz * uz))
         f = 4 * x[5 * g + 4] / x[5 * g + 3] / energy
-        gradient[5 * g:5 * g + 5] = f * m1, f * m2, f * m3, f * m4, 2 * m0 / energy
+        gradient[5 * g], gradient[5 * g + 1], gradient[5 * g + 2] = f * m1, f * m2, f * m3
+        gradient[5 * g + 3], gradient[5 * g + 4] = f * m4, 2 * m0 / energy
     return cost, gradient
 
 def rosenbrock(x):

@@ -57,8 +57,17 @@ impl<'a> Descent<'a> {
             .cost_tolerance(tolerance)
             .max_evaluations(evaluations)
             .first_step(0.5);
-        let mut new =
-            Self { objective, solver, units, x, gradient: Vec::new(), cost: 0.0, iterations: 0, finished: false, extra: 0 };
+        let mut new = Self {
+            objective,
+            solver,
+            units,
+            x,
+            gradient: Vec::new(),
+            cost: 0.0,
+            iterations: 0,
+            finished: false,
+            extra: 0,
+        };
         new.run(0)?;
         Ok(new)
     }

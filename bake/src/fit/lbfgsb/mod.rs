@@ -189,12 +189,17 @@ impl Lbfgsb {
         if !(slope < 0.0) {
             return Ok(None);
         }
-        // Without memory the target is only a direction; its length means nothing (L-BFGS-B: a step of length 1).
-        let first = match self.memory.pairs() {
-            0 => self.first_step.unwrap_or_else(|| dot(&d, &d).sqrt().recip()).min(1.0),
+        // Without memory the target is only a direction; its length means nothing unless the box gives it one
+        // (L-BFGS-B: a first step of length 1, or to the Cauchy point where all variables are boxed).
+        let fresh = self.memory.pairs() == 0;
+        let finite = |bounds: &[f64]| bounds.iter().filter(|b| b.is_finite()).count();
+        let (low, high) = (finite(&self.lower), finite(&self.upper));
+        let first = match self.first_step {
+            Some(step) if fresh => step.min(1.0),
+            None if fresh && low.min(high) < x.len() => dot(&d, &d).sqrt().recip().min(1.0),
             _ => 1.0,
         };
-        let longest = if self.memory.pairs() == 0 { 1.0 } else { self.longest(x, &d).max(1.0) };
+        let longest = if fresh && low + high > 0 { 1.0 } else { self.longest(x, &d).max(1.0) };
         let mut search = Search::new(cost, slope, first, longest);
         let mut best: Step = None;
         let mut retreats = 0;
