@@ -105,16 +105,17 @@ def scipy_best(f, start, bounds, evaluations, memory):
 
 def ours(arguments):
     trace = json.loads(subprocess.run([str(a) for a in arguments], check=True, capture_output=True, text=True).stdout)
-    return trace[-1][1], trace[-1][0]
+    return trace[-1][1], trace[-1][0], trace
 
 def main():
     program, volumes = sys.argv[1], sys.argv[2:]
     worse = 0
-    print("| problem | evaluations allowed | ours | SciPy |\n|---|---|---|---|")
+    print("| problem | evaluations allowed | ours | SciPy | ours reaches SciPy's end after |\n|---|---|---|---|---|")
     def row(name, evaluations, mine, theirs, floor=0.0):
         nonlocal worse
         worse += not mine[0] <= max(theirs[0] * 1.001, floor)
-        print(f"| {name} | {evaluations} | {mine[0]:.6g} after {mine[1]} | {theirs[0]:.6g} after {theirs[1]} |", flush=True)
+        level = next((n for n, cost in mine[2] if cost <= theirs[0] * 1.000001), "-")
+        print(f"| {name} | {evaluations} | {mine[0]:.6g} after {mine[1]} | {theirs[0]:.6g} after {theirs[1]} | {level} |", flush=True)
     start = lambda n: np.where(np.arange(n) % 2 == 0, -1.2, 1.0)
     for name, n, f, x, bounds in [
         ("rosenbrock", 2, rosenbrock, start(2), None),

@@ -118,7 +118,8 @@ impl<'a> Descent<'a> {
         let mut gradient = vec![0.0; x.len()];
         let cost = self.objective.cost_gradient(&x, &mut gradient);
         self.extra += 1;
-        if !(cost < self.cost) {
+        let lower = cost < self.cost;
+        if !lower {
             return false;
         }
         (self.x, self.gradient, self.cost, self.finished) = (x, gradient, cost, false);
@@ -135,7 +136,8 @@ impl<'a> Descent<'a> {
         let mut gradient = vec![0.0; x.len()];
         let cost = self.objective.cost_gradient(&x, &mut gradient);
         self.extra += 1;
-        if !(cost < self.cost) {
+        let lower = cost < self.cost;
+        if !lower {
             return false;
         }
         (self.x, self.gradient, self.cost, self.finished) = (x, gradient, cost, false);

@@ -216,9 +216,7 @@ impl CostGradient for Objective {
         all.for_each(|((gradient, g), kernel)| {
             let m = moments(kernel, error, &self.lattice);
             let factor = 4.0 * g[4] / g[3] / self.energy;
-            for a in 0..3 {
-                gradient[a] = factor * m.first[a];
-            }
+            gradient[..3].copy_from_slice(&m.first.map(|m| factor * m));
             gradient[3] = factor * m.second;
             gradient[4] = 2.0 * m.zeroth / self.energy;
         });

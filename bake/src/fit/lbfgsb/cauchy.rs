@@ -81,7 +81,8 @@ pub(super) fn cauchy_point(x: &[f64], gradient: &[f64], lower: &[f64], upper: &[
         to_minimum = -slope / curvature;
         now = time;
         // Past the last breakpoint of a path that is bounded everywhere nothing moves any more.
-        if !(slope < 0.0) {
+        let falling = slope < 0.0;
+        if !falling {
             to_minimum = 0.0;
             break;
         }

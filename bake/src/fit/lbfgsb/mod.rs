@@ -67,7 +67,8 @@ impl Lbfgsb {
         if lower.len() != upper.len() {
             return Err(LbfgsbError::Bounds(format!("{} lower and {} upper", lower.len(), upper.len())));
         }
-        if let Some(i) = (0..lower.len()).find(|&i| !(lower[i] <= upper[i])) {
+        let ordered = |i: usize| lower[i] <= upper[i];
+        if let Some(i) = (0..lower.len()).find(|&i| !ordered(i)) {
             return Err(LbfgsbError::Bounds(format!("variable {i}: lower {} and upper {}", lower[i], upper[i])));
         }
         Ok(Self {
@@ -186,7 +187,8 @@ impl Lbfgsb {
     ) -> Result<Step, Error> {
         let d: Vec<f64> = target.iter().zip(x).map(|(t, x)| t - x).collect();
         let slope = dot(&d, g);
-        if !(slope < 0.0) {
+        let falling = slope < 0.0;
+        if !falling {
             return Ok(None);
         }
         // Without memory the target is only a direction; its length means nothing unless the box gives it one
