@@ -366,11 +366,11 @@ mod tests {
         let harmonics = sampled.harmonics(4, &d);
         let light =
             IncidentRadiance::Harmonics((0..16).map(|k| [harmonics[0][k], harmonics[1][k], harmonics[2][k]]).collect());
-        for c in 0..3 {
+        for (c, harmonics) in harmonics.iter().enumerate() {
             for (a, b) in light.sampled(&d)[c].iter().zip(&sampled.sampled(&d)[c]) {
                 assert!((a - b).abs() < 1e-5);
             }
-            assert_eq!(light.harmonics(2, &d)[c], harmonics[c][..4]);
+            assert_eq!(light.harmonics(2, &d)[c], harmonics[..4]);
         }
     }
 }

@@ -21,7 +21,7 @@ pub fn decay(x: f32) -> f32 {
     let p = p * f + 0.009_671_513;
     let p = p * f + 0.055_507_336;
     let p = p * f + 0.240_222_42;
-    let p = p * f + 0.693_147;
+    let p = p * f + std::f32::consts::LN_2;
     let p = p * f + 1.0;
     // -126 <= n <= 0 sits in the low bits of `shifted`; moved into the exponent it multiplies p (0.7 to 1.42) by 2^n.
     f32::from_bits(p.to_bits().wrapping_add(shifted.to_bits() << 23))
@@ -38,7 +38,7 @@ pub fn erfcx(x: f32) -> f32 {
     let p = p * t + 0.141_431_84;
     let p = p * t + 0.168_541_9;
     let p = p * t + 0.207_842_71;
-    let p = p * t + 0.225_669_59;
+    let p = p * t + 0.225_669_6;
     let p = p * t + 0.225_675_87;
     t * p
 }

@@ -10,7 +10,7 @@ use crate::transport::compensated::centres::{
     Basis, CentreRadiance, IncidentRadiance, evaluate_depth, gains, scatter_directions, scatter_harmonics,
 };
 use crate::transport::compensated::depth::{DirectionalDepth, harmonic_depth};
-use crate::transport::compensated::diffusion::Diffusion;
+use crate::transport::compensated::diffusion::{Channel, Diffusion};
 use crate::transport::compensated::exponential::Exponential;
 use crate::transport::compensated::integral::IntegralTransport;
 use crate::transport::compensated::overlap::OverlapGrid;
@@ -175,8 +175,8 @@ impl CentreTransport {
                 let brightest = sampled[c].iter().copied().fold(0.0, f32::max);
                 let before: Option<Vec<f32>> =
                     start.filter(|s| s.level.len() == n).map(|s| s.level.iter().map(|l| l[c]).collect());
-                let level =
-                    diffusion.add(&mut out.coefficients, order, c, scale[c], &banded, brightest, before.as_deref());
+                let channel = Channel { index: c, optical_scale: scale[c], brightest };
+                let level = diffusion.add(&mut out.coefficients, order, &banded, channel, before.as_deref());
                 out.level.iter_mut().zip(level).for_each(|(out, l)| out[c] = l);
             }
         }

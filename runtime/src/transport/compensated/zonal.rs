@@ -55,7 +55,7 @@ pub fn ray_depth(d: f64, mu: f64) -> f64 {
 
 /// `G(k/2)` for k > 0.
 fn gamma_half(k: usize) -> f64 {
-    let (mut value, mut at) = if k % 2 == 0 { (1.0, 2) } else { (PI.sqrt(), 1) };
+    let (mut value, mut at) = if k.is_multiple_of(2) { (1.0, 2) } else { (PI.sqrt(), 1) };
     while at < k {
         value *= at as f64 / 2.0;
         at += 2;
