@@ -12,7 +12,7 @@ use multiversion::multiversion;
 use rayon::prelude::*;
 
 use crate::medium::gaussian_points::LANES;
-use crate::sphere::harmonics::{BAND, MAX_COEFFICIENTS, MAX_ORDER, evaluate};
+use crate::sphere::harmonics::{BAND, MAX_COEFFICIENTS, MAX_ORDER, evaluate, limit_to_positive};
 use crate::sphere::quadrature::Directions;
 use crate::sphere::triple::add_product;
 use crate::transport::compensated::decay::decay;
@@ -213,9 +213,9 @@ pub fn scatter_harmonics(
             }
             let mut product = [0.0; MAX_COEFFICIENTS];
             add_product(order, &radiance[c], &transmittance, &mut product);
+            // Truncated products may turn negative; radiance cannot.
+            limit_to_positive(&mut product[..bands], f32::MAX);
             scatter(&product[..bands], &gains(medium, c), c, out);
-            // Truncated products may turn the mean negative; radiance cannot be.
-            out[0][c] = out[0][c].max(0.0);
         }
     });
     out
