@@ -1,8 +1,8 @@
 //! Which Gaussians share a place, and how: the shares `u_h = w_h B_h / sum w B` on a grid of cells.
 //!
 //! A cell lists the Gaussians within 3 radii of its centre with their share there (from 0.2 % on), and the density of their sum. The
-//! grid spans all supports with up to [`RESOLUTION`] cells along its longest side, coarser where the lists would exceed
-//! [`LARGEST_LISTS`] entries: memory is bounded at any overlap.
+//! grid spans all supports with up to 64 cells along its longest side, coarser where the lists would exceed
+//! 4 million entries: memory is bounded at any overlap.
 //!
 //! Cost: one exponential for each entry; about 113 (r / cell)^3 entries a Gaussian.
 
