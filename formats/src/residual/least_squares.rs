@@ -5,7 +5,7 @@
 //! solution of `(A + r I) w = b`, `r = ridge f^-t + 1e-6 trace(A)`, by elimination of the symmetric matrix without
 //! pivots (LDL^T). The elements of the sums are independent and every other sum runs in the order written, so that the
 //! bits do not depend on the vector width. An update costs N^2 and a
-//! solution N^3 / 2 multiplications; half of the codec's time is here.
+//! solution N^3 / 2 multiplications.
 //!
 //! Source: Meyer and Tischer 2001, "GLICBAWLS", section 3 (weighted least squares in lossless coding); we keep the sums
 //! for tiles of the image (see `predict.rs`) in place of solving anew for every voxel.
