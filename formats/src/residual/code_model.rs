@@ -15,8 +15,7 @@
 //! after a "no" in slot 0. `x_6 = 0.3`, `x_7 = 0`. The weights of the mixture and its refinement are chosen by
 //! (slot, level); the probability coded is the mean of mixed and refined one, `floor(65536 p)` within 64..65472.
 //!
-//! About five decisions of 40 ns a code. Measured: refinement, counters and discord together save 1 %; nearly all the
-//! gain over a plain adaptive Golomb code is in the real-valued means and scales.
+//! About log2(scale) + 3 decisions a code. Measured: the distance between predictors in the scales saves 0.4 %.
 //!
 //! Source: real-valued predictions with a parametric distribution as in Meyer and Tischer 1997 (TMW), section 4;
 //! mixing as in Mahoney 2005 (see `mixing.rs`).

@@ -4,8 +4,8 @@
 //! decision "full", each with a counter chosen by the states of the blocks before it along the three axes. Then the
 //! voxels of the mixed blocks, in plain voxel order of the whole box, each from the bits that came before it: three
 //! neighbourhoods index a counter each (`contexts`: first bit highest), and a mixer (rate 0.01, weights 0.4 at first,
-//! chosen by the low 7 bits of the first context) weighs the three. Counters average 250 decisions. About 40 ns a voxel of a mixed block, 20 ns a
-//! block; probabilities stay within 1/4096 of certainty.
+//! chosen by the low 7 bits of the first context) weighs the three. Counters average 250 decisions. Measured: 4 % of the
+//! codec's time, 0.10 to 0.13 bit for each voxel of the support of a rough plume. Probabilities stay within 1/4096 of certainty.
 //!
 //! Source: context templates as in JBIG2 (ITU-T T.88, section 6.2.5.3), here in three dimensions and mixed.
 
