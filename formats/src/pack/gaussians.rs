@@ -38,7 +38,7 @@ pub fn to_bytes(g: &Gaussian) -> [u8; GAUSSIAN_BYTES] {
 
 /// Gaussians from their resident bytes; fails unless they are whole. `what` names the frame.
 pub fn from_bytes(path: &Path, what: &str, bytes: &[u8]) -> Result<Vec<Gaussian>> {
-    if bytes.len() % GAUSSIAN_BYTES != 0 {
+    if !bytes.len().is_multiple_of(GAUSSIAN_BYTES) {
         let expected = format!("a multiple of {GAUSSIAN_BYTES}");
         return Err(Error::invalid(path, format!("{what}.gaussians"), format!("{} bytes", bytes.len()), expected));
     }
