@@ -13,7 +13,7 @@
 //! - growth is bounded: r by a tenth up to eight times, then m by one up to four times, then there is no
 //!   hash and the caller keeps the rank layout. Each attempt has a bounded number of tries. It always ends.
 //!
-//! Cost: about K log K; 0.3 microseconds a key for a tile that succeeds at once. Deterministic: own generator (PCG,
+//! Cost: about K log K; 0.2 microseconds a key for a tile of 6.9 million that succeeds at once. Deterministic: own generator (PCG,
 //! O'Neill 2014), seeded by the caller.
 
 use smoke_formats::residual::ResidualCodes;
@@ -232,7 +232,7 @@ impl Pcg {
 mod tests {
     use super::*;
     use crate::residual::tests::frame;
-    use smoke_formats::residual::hash::{HashView, assemble};
+    use smoke_formats::residual::hash::{HashView, assemble, slot_of};
     use std::path::Path;
 
     /// Finds a hash, assembles it (which fails on any clash) and reads all codes back.
@@ -320,6 +320,17 @@ mod tests {
             let used = usable(9, r, &stacks);
             assert!(used >= r && !used.is_multiple_of(3) && !(14..=18).contains(&used), "{r} {used}");
         }
+    }
+
+    #[test]
+    fn keys_have_their_own_slots_in_a_table_too_wide_for_eight_bits() {
+        let mut keys = vec![];
+        for_each_key(&[frame([300, 300, 2], |x, y, _| ((x * 31 + y * 17) % 9 == 0).then_some(1))], |p, _| keys.push(p));
+        let (side, offset_side) = (257, 24);
+        let offsets = place(&keys, side, offset_side, &mut Pcg::new(1)).unwrap();
+        let mut slots: Vec<usize> = keys.iter().map(|&p| slot_of(side, offset_side, &offsets, p)).collect();
+        slots.sort_unstable();
+        assert!(slots.len() == 20_000 && slots.windows(2).all(|pair| pair[0] < pair[1]));
     }
 
     #[test]

@@ -18,8 +18,8 @@
 //! For a promised PSNR the first step is that of a uniform quantiser, error step^2 / 12 (Widrow 1956), and the search
 //! goes on with measured errors: a clamp at zero and codes of zero make it smaller.
 //!
-//! Cost: three passes over the box and one over the support, about 8 ns a voxel of the support; PSNR adds one pass over
-//! the support for each step tried, 3 to 6 of them.
+//! Cost: one pass over the box and one over the support, about 12 ns a voxel of the support; a PSNR tries a few steps and
+//! takes three times as long.
 
 use super::decibel;
 use smoke_formats::residual::{MAX_CODE, ResidualCodes, dequantise};

@@ -12,7 +12,7 @@
 //!
 //! Effect on a fit: each lattice moves a parameter by at most 1/131070 of its range. On 300 Gaussians whose fit error is
 //! 1 %, the fit error changes by less than 0.01 % of itself (see the tests), against the 1 % that would matter.
-//! Size: 20 bytes a Gaussian plain, 9.4 snapped for 600 of them.
+//! Size: 20 bytes a Gaussian plain, below 9.5 snapped for 600 of them, evenly spread.
 
 use super::at_rest::{deflate, inflate};
 use crate::bounded::Bytes;
