@@ -168,7 +168,7 @@ pub(crate) mod tests {
         }
 
         pub(crate) fn below(&mut self, n: u32) -> u32 {
-            (u64::from(self.next()) * u64::from(n) >> 32) as u32
+            ((u64::from(self.next()) * u64::from(n)) >> 32) as u32
         }
     }
 
