@@ -86,7 +86,7 @@ fn the_first_thing_wrong_is_named_in_the_order_of_the_file() {
     let sequence = all.iter().position(|s| s.kind == KIND_SEQUENCE).unwrap();
     let (sequence_at, frames_at) = (all[sequence].offset as usize, frames.offset as usize + 8);
     let padding = (all[0].offset + all[0].bytes_at_rest) as usize;
-    assert!(padding % ALIGNMENT as usize != 0);
+    assert!(!padding.is_multiple_of(ALIGNMENT as usize));
     type Spoil<'a> = Box<dyn Fn(&mut Vec<u8>) + 'a>;
     let put = |at: usize, value: Vec<u8>| -> Spoil {
         Box::new(move |b: &mut Vec<u8>| b[at..at + value.len()].copy_from_slice(&value))

@@ -12,7 +12,7 @@
 //!
 //! Effect on a fit: each lattice moves a parameter by at most 1/131070 of its range. On 300 Gaussians whose fit error is
 //! 1 %, the fit error changes by less than 0.01 % of itself (see the tests), against the 1 % that would matter.
-//! Size: 20 bytes a Gaussian plain, 9.4 snapped for 600 of them.
+//! Size: 20 bytes a Gaussian plain, below 9.5 snapped for 600 of them, evenly spread.
 
 use super::at_rest::{deflate, inflate};
 use crate::bounded::Bytes;
@@ -38,7 +38,7 @@ pub fn to_bytes(g: &Gaussian) -> [u8; GAUSSIAN_BYTES] {
 
 /// Gaussians from their resident bytes; fails unless they are whole. `what` names the frame.
 pub fn from_bytes(path: &Path, what: &str, bytes: &[u8]) -> Result<Vec<Gaussian>> {
-    if bytes.len() % GAUSSIAN_BYTES != 0 {
+    if !bytes.len().is_multiple_of(GAUSSIAN_BYTES) {
         let expected = format!("a multiple of {GAUSSIAN_BYTES}");
         return Err(Error::invalid(path, format!("{what}.gaussians"), format!("{} bytes", bytes.len()), expected));
     }

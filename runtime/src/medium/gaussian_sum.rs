@@ -303,8 +303,7 @@ fn gather<const B: usize>(kernel: &Kernel, first: usize, field: &[Block], lattic
             }
         }
     }
-    for b in 0..B {
-        let (bx, ux) = (&kernel.bx[first + b], &kernel.ux[first + b]);
+    for (b, (bx, ux)) in kernel.bx[first..].iter().zip(&kernel.ux[first..]).take(B).enumerate() {
         for l in 0..LANES {
             let (bx, ux) = (f64::from(bx[l]), f64::from(ux[l]));
             let [m0, my, mz, m2] = [0, 1, 2, 3].map(|k| bx * f64::from(columns[k][b][l]));
@@ -450,8 +449,14 @@ mod tests {
         let lattice = Lattice { space: UnitSpace::of_box([0; 3], [70, 30, 30]), origin: [0; 3], dims: [70, 30, 30] };
         let mut field = vec![[0.0f32; LANES]; lattice.slice_blocks() * 30];
         // Values in the padding must not be seen.
-        field.as_flattened_mut().iter_mut().enumerate().for_each(|(i, v)| *v = ((i * 7919) % 1000) as f32 / 500.0 - 1.0);
-        for g in [gaussian([0.5, 0.2, 0.2], 0.09, 1.0), gaussian([0.97, 0.4, 0.1], 0.05, 1.0), gaussian([0.0; 3], 0.3, 1.0)] {
+        field
+            .as_flattened_mut()
+            .iter_mut()
+            .enumerate()
+            .for_each(|(i, v)| *v = ((i * 7919) % 1000) as f32 / 500.0 - 1.0);
+        for g in
+            [gaussian([0.5, 0.2, 0.2], 0.09, 1.0), gaussian([0.97, 0.4, 0.1], 0.05, 1.0), gaussian([0.0; 3], 0.3, 1.0)]
+        {
             let mut kernel = Kernel::default();
             kernel.place(&lattice, g.center.map(f64::from), f64::from(g.radius));
             let found = moments(&kernel, &field, &lattice);
