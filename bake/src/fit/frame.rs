@@ -6,7 +6,7 @@
 //! `error_ratio` times that of the first frame, insert Gaussians where density is missing and minimise again, at most
 //! 8 in all. Where we deviate: insertions go by expected gain, half of what is left of the 8 at a time, which takes
 //! four rounds instead of eight; and the number of Gaussians is held ([`FitSettings::steady`]): over the 64 frames of a
-//! plume the mean error is .0449 instead of .0512 at the same evaluations (docs/decisions/fit-sequence.md).
+//! plume the mean error is .0449 instead of .0512 at the same evaluations (docs/decisions/023-fit-sequence.md).
 
 use super::descent::{Descent, RADII, WEIGHTS};
 use super::initial::initial;

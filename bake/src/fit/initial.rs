@@ -1,7 +1,7 @@
 //! Where a first fit starts: Gaussians spread over the density, one for an equal share of it each.
 //!
 //! The non-zero voxels are put in Morton order, which keeps neighbours together, and cut into n strata of equal
-//! `sum D`; each stratum gives one Gaussian at its centroid, with radius [`RADIUS`] times the edge of a cube of its volume.
+//! `sum D`; each stratum gives one Gaussian at its centroid, with radius 0.7 times the edge of a cube of its volume.
 //! All weights then follow from one factor, `<S, D> / <S, S>`: the least-squares best for those centres and radii.
 //! Cost: one sort of the occupied voxels, one evaluation.
 

@@ -241,7 +241,7 @@ pub fn natural_units(x: &[f64], objective: &Objective) -> Vec<f64> {
     units
 }
 
-/// Measured, with [`RADIUS_UNIT`] and [`LEAST_WEIGHT`]: docs/decisions/fit-optimiser.md.
+/// Measured, with [`RADIUS_UNIT`] and [`LEAST_WEIGHT`]: docs/decisions/022-fit-optimiser.md.
 const CENTRE_UNIT: f64 = 3.0;
 /// See [`CENTRE_UNIT`].
 const RADIUS_UNIT: f64 = 2.0;
@@ -339,8 +339,8 @@ mod tests {
             // cut's border moves with the radius: for a constant e its share of dE/dr is 3 exp(-9) 40 r^2 (area weighted
             // with B) over 3 pi^(3/2) r^2 = 9e-4, and more where e has the other sign there: 1e-2, and of the mean entry.
             let tolerance = 1e-2 * difference.abs() + 1e-2 * scale;
-            let wrong = !((gradient[k] - difference).abs() <= tolerance);
-            wrong.then(|| format!("variable {k}: gradient {:e}, difference {difference:e}", gradient[k]))
+            let right = (gradient[k] - difference).abs() <= tolerance;
+            (!right).then(|| format!("variable {k}: gradient {:e}, difference {difference:e}", gradient[k]))
         };
         (0..x.len()).filter_map(&mut check).collect()
     }

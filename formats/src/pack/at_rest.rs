@@ -8,8 +8,10 @@
 //! frames u32 | m u32 | r u32 | deflated offsets: length u64 | each frame: length u64 | deflated offsets | coded frames
 //! ```
 
+use super::gaussians::{self, GAUSSIAN_BYTES};
 use super::records::Codec;
 use crate::bounded::Bytes;
+use crate::gaussian::Gaussian;
 use crate::residual::hash::{HashTable, HashView, MAX_FRAMES};
 use crate::residual::rank::RankView;
 use crate::residual::{Residual, ResidualCodes, coded, hash, rank};
@@ -43,6 +45,20 @@ pub fn inflate(path: &Path, what: &str, packed: &[u8], expected: u64) -> Result<
         0 => Ok(bytes),
         extra => Err(Error::invalid(path, what, format!("{extra} bytes after the zlib stream"), "its end")),
     }
+}
+
+/// The Gaussians of a section at rest that claims `resident` bytes; `what` names the frame in errors.
+pub fn decode_gaussians(path: &Path, what: &str, bytes: &[u8], codec: Codec, resident: u64) -> Result<Vec<Gaussian>> {
+    let list = match codec {
+        Codec::Snapped => gaussians::decode(path, bytes)?,
+        Codec::Deflate => gaussians::from_bytes(path, what, &inflate(path, what, bytes, resident)?)?,
+        Codec::Raw | Codec::Coded => gaussians::from_bytes(path, what, bytes)?,
+    };
+    if (list.len() * GAUSSIAN_BYTES) as u64 != resident {
+        return Err(Error::invalid(path, format!("{what}.gaussians"), list.len(), resident / GAUSSIAN_BYTES as u64));
+    }
+    gaussians::check(path, what, &list)?;
+    Ok(list)
 }
 
 /// A rank section at rest, and the number of its resident bytes.
