@@ -49,7 +49,7 @@ pub fn default_promise(survey: &Survey) -> Promise {
 }
 
 /// Seconds that a frame took, by stage.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, serde::Deserialize, serde::Serialize)]
 pub struct Seconds {
     /// Reading and checking the source.
     pub read: f64,
