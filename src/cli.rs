@@ -372,7 +372,7 @@ mod tests {
         assert_eq!((args.psnr, args.max_error, args.residual), (Some(47.0), None, ResidualAddress::Auto));
         assert!(parse::<BakeArgs>(&["in", "-o", "a", "--psnr", "47", "--max-error", "0.1"]).is_err());
         assert!(parse::<BakeArgs>(&["in", "-o", "a", "--max-error", "nan"]).is_err());
-        assert!(parse::<BakeArgs>(&["in", "-o", "a", "--gaussians", "0"]).is_err());
+        assert!(parse::<BakeArgs>(&["in", "-o", "a", "--gaussians", "65537"]).is_err());
     }
 
     #[test]

@@ -265,7 +265,7 @@ fn lay_out(
     if settings.residual == ResidualMode::Rank {
         return Ok(None);
     }
-    let codes = frames.par_iter().map(|f| f.decode_codes(path)).collect::<smoke_formats::Result<Vec<_>>>()?;
+    let codes = frames.par_iter().map(|f| f.codes(path)).collect::<smoke_formats::Result<Vec<_>>>()?;
     let layout = choose(path, &codes, settings.residual, settings.seed)?;
     if let Some(bytes) = layout.hash_bytes {
         let share = bytes / frames.len() as u64;

@@ -61,14 +61,12 @@ pub fn decode_gaussians(path: &Path, what: &str, bytes: &[u8], codec: Codec, res
     Ok(list)
 }
 
-/// A rank section at rest, and the number of its resident bytes.
-pub fn encode_rank(codes: &ResidualCodes, codec: Codec) -> (Vec<u8>, u64) {
-    let resident = rank::encode(codes);
-    let length = resident.len() as u64;
+/// A rank section at rest; `resident` is the rank layout of `codes`.
+pub fn encode_rank(codes: &ResidualCodes, resident: &[u8], codec: Codec) -> Vec<u8> {
     match codec {
-        Codec::Coded => (coded::encode(codes), length),
-        Codec::Deflate => (deflate(&resident), length),
-        Codec::Raw | Codec::Snapped => (resident, length),
+        Codec::Coded => coded::encode(codes),
+        Codec::Deflate => deflate(resident),
+        Codec::Raw | Codec::Snapped => resident.to_vec(),
     }
 }
 
