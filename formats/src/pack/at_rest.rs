@@ -181,12 +181,13 @@ mod tests {
     fn every_prefix_an_extra_byte_and_a_wrong_length_are_refused_by_every_codec() {
         let path = Path::new("p");
         let frames = [ball([9, 8, 7], 60, 1)];
+        let resident = rank::encode(&frames[0]);
         let hash = |codec, bytes: &[u8], resident| decode_hash(path, bytes.to_vec(), codec, resident);
         let rank = |codec, bytes: &[u8], resident| decode_rank(path, bytes.to_vec(), codec, resident);
         type Decode<'a> = &'a dyn Fn(Codec, &[u8], u64) -> Result<Residual>;
         for codec in CODECS {
             let kinds: [(Decode, (Vec<u8>, u64)); 2] = [
-                (&rank, encode_rank(&frames[0], codec)),
+                (&rank, (encode_rank(&frames[0], &resident, codec), resident.len() as u64)),
                 (&hash, encode_hash(path, &frames, &trivial(&frames), codec).unwrap()),
             ];
             for (decode, (bytes, resident)) in kinds {
