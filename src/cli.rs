@@ -25,6 +25,8 @@ pub struct Cli {
 /// What to do.
 #[derive(Debug, Subcommand)]
 pub enum Command {
+    /// Bake a sequence of volumes into one pack.
+    Bake(BakeArgs),
     /// Measure how far an image is from a reference: RMSE, PSNR, bias, largest error.
     Compare(CompareArgs),
     /// Show what a pack holds: sequence, settings, and sizes, errors and seconds of every frame.
@@ -94,6 +96,26 @@ pub enum ResidualAddress {
     Auto,
 }
 
+/// Which Gaussians are moved to where they are needed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum TeleportRule {
+    /// Several at once, by expected gain and loss.
+    #[default]
+    Batch,
+    /// The one of least integral, to the voxel of largest error (Zhou et al. 2008).
+    Single,
+}
+
+/// How many Gaussians later frames have.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum GaussianCount {
+    /// As many as the first, as far as they are of use.
+    #[default]
+    Steady,
+    /// What deletion and insertion by the error ratio leave (Zhou et al. 2008).
+    Adaptive,
+}
+
 /// How sections lie in the pack.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
 pub enum AtRest {
@@ -117,9 +139,9 @@ pub struct BakeArgs {
     pub grid: String,
     /// Frames to bake: 1001-1064, 1001-1064x2, 1,5,9 [default: all there are].
     #[arg(long, value_name = "RANGE")]
-    pub frames: Option<String>,
-    /// Gaussians in the first frame.
-    #[arg(long, value_name = "N", default_value_t = 1000, value_parser = clap::value_parser!(u32).range(1..=65536))]
+    pub frames: Option<FrameSelection>,
+    /// Gaussians in the first frame; 0 leaves everything to the residual.
+    #[arg(long, value_name = "N", default_value_t = 1000, value_parser = clap::value_parser!(u32).range(0..=65536))]
     pub gaussians: u32,
     /// Smallest radius, in lengths of the box's longest side.
     #[arg(long, value_name = "R", default_value_t = 0.015, value_parser = positive)]
@@ -133,12 +155,21 @@ pub struct BakeArgs {
     /// Largest weight, as a part of the largest density.
     #[arg(long, value_name = "W", default_value_t = 1.0, value_parser = positive)]
     pub weight_max: f64,
-    /// Most iterations of one minimisation.
-    #[arg(long, value_name = "N", default_value_t = 500)]
-    pub max_iterations: u32,
+    /// Evaluations of the fit's error in the first frame.
+    #[arg(long, value_name = "N", default_value_t = 200)]
+    pub first_evaluations: u32,
+    /// Evaluations of the fit's error in a later frame, without those after insertions.
+    #[arg(long, value_name = "N", default_value_t = 40)]
+    pub next_evaluations: u32,
     /// Iterations between two moves of the least useful Gaussian in the first frame; 0 for never.
     #[arg(long, value_name = "N", default_value_t = 20)]
     pub teleport_every: u32,
+    /// Which Gaussians move then.
+    #[arg(long, value_enum, default_value_t)]
+    pub teleport_rule: TeleportRule,
+    /// How many Gaussians a later frame has.
+    #[arg(long, value_enum, default_value_t)]
+    pub count: GaussianCount,
     /// Error over the first frame's error at which a later frame gets another Gaussian.
     #[arg(long, value_name = "RATIO", default_value_t = 1.1, value_parser = positive)]
     pub rho: f64,
@@ -169,10 +200,10 @@ pub struct BakeArgs {
     /// Read and check the input, say what would be done, write nothing.
     #[arg(long)]
     pub dry_run: bool,
-    /// Frames per second of the sequence, kept in the pack.
-    #[arg(long, value_name = "FPS", default_value_t = 24.0, value_parser = positive)]
-    pub fps: f64,
-    /// Seed of every random choice.
+    /// Frames per second of the sequence, kept in the pack [default: not stated].
+    #[arg(long, value_name = "FPS", value_parser = positive)]
+    pub fps: Option<f64>,
+    /// Seed of the search for perfect hashes, the only random choice.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
     /// Threads; the result does not depend on it [default: one for each core].

@@ -1,6 +1,7 @@
 //! smoke-bake: bakes smoke sequences into relightable packs, and renders them.
 
 mod answer;
+mod bake;
 mod cli;
 mod compare;
 #[cfg_attr(not(test), expect(dead_code, reason = "`demo` shows its frames with it"))]
@@ -9,7 +10,6 @@ mod failure;
 mod inspect;
 mod layers;
 mod progress;
-#[cfg_attr(not(test), expect(dead_code, reason = "`bake` writes through it"))]
 mod seconds;
 #[cfg(test)]
 mod testing;
@@ -34,6 +34,7 @@ fn run() -> Result<(), Failure> {
     let command = layers::command(Path::new(layers::FILE_NAME))?;
     let matches = command.try_get_matches()?;
     match Cli::from_arg_matches(&matches)?.command {
+        Command::Bake(args) => bake::run(&args),
         Command::Compare(args) => compare::run(&args),
         Command::Inspect(args) => inspect::run(&args),
         Command::Validate(args) => validate::run(&args),

@@ -67,6 +67,19 @@ impl Progress {
         }
     }
 
+    /// What is being done now, within a step.
+    pub fn describe(&self, what: String) {
+        match &self.shown {
+            Shown::Bar(bar) => bar.set_message(what),
+            Shown::Lines(start, lines) => {
+                let mut lines = lines.lock().unwrap_or_else(|e| e.into_inner());
+                lines.what = what;
+                lines.advance(0, start.elapsed());
+            }
+            Shown::Nothing => {}
+        }
+    }
+
     /// Ends the bar and leaves its line.
     pub fn finish(self) {
         if let Shown::Bar(bar) = self.shown {
