@@ -73,6 +73,8 @@ fn report_clamped(survey: &Survey) {
 fn settings(args: &BakeArgs, name: String) -> BakeSettings {
     let fit = FitSettings {
         gaussians: args.gaussians as usize,
+        radius: [args.radius_min, args.radius_max],
+        weight: [args.weight_min, args.weight_max],
         first_evaluations: args.first_evaluations as usize,
         next_evaluations: args.next_evaluations as usize,
         teleport_every: args.teleport_every.into(),
