@@ -46,7 +46,7 @@ impl GaussianPoints {
             |index, what, found: f32, expected| Err(GaussianError { index, what, found: f64::from(found), expected });
         for (index, g) in gaussians.iter().enumerate() {
             for &c in &g.center {
-                if !(c.abs() <= LARGEST) {
+                if !(-LARGEST..=LARGEST).contains(&c) {
                     return fail(index, "center", c, "-1e6 to 1e6");
                 }
             }

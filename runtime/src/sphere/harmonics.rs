@@ -147,6 +147,22 @@ pub fn convolve(coefficients: &mut [f32], zonal: &[f32]) {
     }
 }
 
+/// Limits coefficients to what a function with values in [0, `largest`] can have: a mean between 0 and `largest`, and in
+/// band l, by the addition theorem, a vector of length <= sqrt(2l+1) times coefficient 0. Legal ones stay as they are.
+pub fn limit_to_positive(coefficients: &mut [f32], largest: f32) {
+    let mean = coefficients[0].clamp(0.0, largest * ZONAL_SCALE[0]);
+    coefficients[0] = mean;
+    for l in 1..coefficients.len().isqrt() {
+        let band = &mut coefficients[l * l..(l + 1) * (l + 1)];
+        let square: f64 = band.iter().map(|&v| f64::from(v) * f64::from(v)).sum();
+        let bound = f64::from(mean) * ((2 * l + 1) as f64).sqrt();
+        if square > bound * bound {
+            let scale = bound / square.sqrt();
+            band.iter_mut().for_each(|v| *v = (f64::from(*v) * scale) as f32);
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -247,6 +263,24 @@ mod tests {
         for i in 0..MAX_COEFFICIENTS {
             assert!((convolved[i] - original[i]).abs() <= 2e-7 * original[i].abs().max(1e-3), "{i}");
         }
+    }
+
+    #[test]
+    fn limits_keep_every_positive_function_and_catch_others() {
+        // A narrow positive function is on the bound: a delta has |band l| = sqrt(2l+1) c_0 exactly.
+        let delta = evaluate(MAX_ORDER, unit(7));
+        let mut limited = delta;
+        limit_to_positive(&mut limited, 1.0);
+        for i in 0..MAX_COEFFICIENTS {
+            assert!((limited[i] - delta[i]).abs() < 1e-6);
+        }
+        limited[3] += 1.0;
+        limited[0] = 9.0;
+        limit_to_positive(&mut limited, 2.0);
+        assert!((limited[0] - 2.0 * ZONAL_SCALE[0]).abs() < 1e-6);
+        let mut negative = delta.map(|v| -v);
+        limit_to_positive(&mut negative, 1.0);
+        assert_eq!(negative, [0.0; MAX_COEFFICIENTS]);
     }
 
     #[test]

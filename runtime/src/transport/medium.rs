@@ -59,7 +59,8 @@ impl MediumParameters {
                 return fail("albedo", self.albedo[c], "0 to 1");
             }
         }
-        if !(self.g.abs() < 1.0) {
+        let proper = self.g.abs() < 1.0;
+        if !proper {
             return fail("g", self.g, "-1 < g < 1");
         }
         Ok(())

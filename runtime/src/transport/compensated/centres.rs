@@ -12,7 +12,7 @@ use multiversion::multiversion;
 use rayon::prelude::*;
 
 use crate::medium::gaussian_points::LANES;
-use crate::sphere::harmonics::{BAND, MAX_COEFFICIENTS, MAX_ORDER, evaluate};
+use crate::sphere::harmonics::{BAND, MAX_COEFFICIENTS, MAX_ORDER, evaluate, limit_to_positive};
 use crate::sphere::quadrature::Directions;
 use crate::sphere::triple::add_product;
 use crate::transport::compensated::decay::decay;
@@ -213,9 +213,9 @@ pub fn scatter_harmonics(
             }
             let mut product = [0.0; MAX_COEFFICIENTS];
             add_product(order, &radiance[c], &transmittance, &mut product);
+            // Truncated products may turn negative; radiance cannot.
+            limit_to_positive(&mut product[..bands], f32::MAX);
             scatter(&product[..bands], &gains(medium, c), c, out);
-            // Truncated products may turn the mean negative; radiance cannot be.
-            out[0][c] = out[0][c].max(0.0);
         }
     });
     out
@@ -366,11 +366,11 @@ mod tests {
         let harmonics = sampled.harmonics(4, &d);
         let light =
             IncidentRadiance::Harmonics((0..16).map(|k| [harmonics[0][k], harmonics[1][k], harmonics[2][k]]).collect());
-        for c in 0..3 {
+        for (c, harmonics) in harmonics.iter().enumerate() {
             for (a, b) in light.sampled(&d)[c].iter().zip(&sampled.sampled(&d)[c]) {
                 assert!((a - b).abs() < 1e-5);
             }
-            assert_eq!(light.harmonics(2, &d)[c], harmonics[c][..4]);
+            assert_eq!(light.harmonics(2, &d)[c], harmonics[..4]);
         }
     }
 }

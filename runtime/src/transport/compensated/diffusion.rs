@@ -52,6 +52,17 @@ pub struct Diffusion {
     inverse_square: Vec<f64>,
 }
 
+/// One colour channel of a solve.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Channel {
+    /// 0 to 2.
+    pub index: usize,
+    /// Extinction per unit length at relative density 1.
+    pub optical_scale: f64,
+    /// The largest radiance of the light, which bounds L0.
+    pub brightest: f32,
+}
+
 /// Mean and vector of the source in one channel, per centre.
 #[derive(Clone, Copy)]
 struct Moments {
@@ -89,7 +100,7 @@ impl Diffusion {
                     *share = f64::from(points.weight[h]).ln() - dot3(to, to) * inverse_square[h];
                     largest = largest.max(*share);
                 }
-                if !(largest > f64::NEG_INFINITY) {
+                if largest == f64::NEG_INFINITY {
                     // Only weightless Gaussians: an empty row.
                     share.fill(0.0);
                     return;
@@ -119,18 +130,16 @@ impl Diffusion {
 
     /// Adds multiple scattering to `radiance` (single scattering, `order^2` coefficients a centre) in one channel.
     ///
-    /// `optical_scale` is the extinction per unit length at relative density 1; `brightest` the largest radiance of
-    /// the light, which bounds L0. `start` is L0 of an earlier solve. Returns L0 at the centres.
+    /// `start` is L0 of an earlier solve. Returns L0 at the centres.
     pub fn add(
         &self,
         radiance: &mut [[f32; 3]],
         order: usize,
-        channel: usize,
-        optical_scale: f64,
         medium: &BandedMedium,
-        brightest: f32,
+        channel: Channel,
         start: Option<&[f32]>,
     ) -> Vec<f32> {
+        let Channel { index: channel, optical_scale, brightest } = channel;
         let (n, stride) = (self.count, order * order);
         let albedo = f64::from(medium.albedo[channel]);
         let forward = if order > 1 { f64::from(medium.moments[1]) } else { 0.0 };
@@ -262,12 +271,12 @@ impl Diffusion {
         // Against the gradient at x = 0, so that a warm start may end at once.
         let enough = TOLERANCE * TOLERANCE * norm(&transpose(&right));
         for _ in 0..ITERATIONS {
-            if !(square > enough) {
+            if square <= enough {
                 break;
             }
             let q = apply(&p);
             let curvature = norm(&q) + damping * norm(&p);
-            if !(curvature > 0.0) {
+            if curvature == 0.0 {
                 break;
             }
             let step = square / curvature;
@@ -298,6 +307,10 @@ mod tests {
 
     const ROOT: f32 = 3.544_907_7;
 
+    fn channel(index: usize, optical_scale: f64, brightest: f32) -> Channel {
+        Channel { index, optical_scale, brightest }
+    }
+
     fn medium(albedo: f32, g: f32) -> BandedMedium {
         MediumParameters { sigma_t: [1.0; 3], albedo: [albedo; 3], g }.banded(4)
     }
@@ -312,11 +325,11 @@ mod tests {
         let (sigma_a, sigma_tr) = (2.0, 5.0);
         let fields = |at: [f64; 3]| -> (f64, f64) {
             let (mut d, mut s) = (0.0, 0.0);
-            for h in 0..30 {
+            for (h, level) in level.iter().enumerate() {
                 let to: [f64; 3] = std::array::from_fn(|k| at[k] - system.centers[h][k]);
                 let term = f64::from(set.weight[h]) * (-dot3(to, to) * system.inverse_square[h]).exp();
                 d += term;
-                s += term * level[h];
+                s += term * level;
             }
             (d, s / d)
         };
@@ -338,11 +351,11 @@ mod tests {
             let expected = 3.0 * sigma_tr * density * (divergence - sigma_a * density * l);
             let mut found = 0.0;
             let mut size = 0.0;
-            for j in 0..30 {
+            for (j, level) in level.iter().enumerate() {
                 let entry = system.geometry[i * 30 + j]
                     - 3.0 * sigma_a * sigma_tr * density * density * system.share[i * 30 + j];
-                found += entry * level[j];
-                size += (entry * level[j]).abs();
+                found += entry * level;
+                size += (entry * level).abs();
             }
             // Second order: h^2 / r^2 = 1e-5 of each term's size, with a factor of 10 for fourth derivatives; rounding
             // 1e-16 / h^2 = 1e-8 of L / kappa terms.
@@ -366,13 +379,13 @@ mod tests {
         for (albedo, expected) in [(0.5, 0.2), (0.99, 1.0)] {
             let mut j = vec![[0.0; 3]; 16];
             j[0][1] = 0.1 * ROOT;
-            let level = system.add(&mut j, 4, 1, 5.0, &medium(albedo, 0.3), 1.0, None);
+            let level = system.add(&mut j, 4, &medium(albedo, 0.3), channel(1, 5.0, 1.0), None);
             assert!((level[0] - expected).abs() < 1e-4, "{level:?}");
             assert!((j[0][1] - (0.1 + albedo * level[0]) * ROOT).abs() < 1e-5);
             assert_eq!((j[0][0], j[1][1]), (0.0, 0.0));
         }
         let mut j = vec![[0.1; 3]; 16];
-        let level = system.add(&mut j, 4, 0, 5.0, &medium(1.0, 0.0), 1.0, None);
+        let level = system.add(&mut j, 4, &medium(1.0, 0.0), channel(0, 5.0, 1.0), None);
         assert_eq!(level, [0.0], "albedo 1: the only row is empty, and damping leaves nothing");
     }
 
@@ -388,7 +401,7 @@ mod tests {
             for (albedo, g) in [(0.0, 0.0), (0.9, 0.6), (1.0, -0.6), (1.0, 0.99), (1.0, -0.99)] {
                 let mut j: Vec<[f32; 3]> = (0..60 * 16).map(|k| [if k % 16 == 0 { 1.0 } else { 0.1 }; 3]).collect();
                 let before = j.clone();
-                let level = system.add(&mut j, 4, 0, optical_scale, &medium(albedo, g), 2.0, None);
+                let level = system.add(&mut j, 4, &medium(albedo, g), channel(0, optical_scale, 2.0), None);
                 assert!(level.iter().all(|&l| (0.0..=2.0).contains(&l)));
                 assert!(j.iter().flatten().all(|v| v.is_finite()));
                 if albedo == 0.0 {
@@ -396,7 +409,7 @@ mod tests {
                 }
             }
         }
-        assert!(Diffusion::new(&points(&[])).add(&mut [], 4, 0, 1.0, &medium(0.9, 0.0), 1.0, None).is_empty());
+        assert!(Diffusion::new(&points(&[])).add(&mut [], 4, &medium(0.9, 0.0), channel(0, 1.0, 1.0), None).is_empty());
     }
 
     #[test]
@@ -404,8 +417,8 @@ mod tests {
         let system = Diffusion::new(&points(&cloud(50, 34)));
         let source: Vec<[f32; 3]> = (0..50).map(|i| [0.5 + 0.01 * i as f32, 0.0, 0.0]).collect();
         let medium = medium(0.9, 0.0);
-        let cold = system.add(&mut source.clone(), 1, 0, 10.0, &medium, 10.0, None);
-        let warm = system.add(&mut source.clone(), 1, 0, 10.0, &medium, 10.0, Some(&cold));
+        let cold = system.add(&mut source.clone(), 1, &medium, channel(0, 10.0, 10.0), None);
+        let warm = system.add(&mut source.clone(), 1, &medium, channel(0, 10.0, 10.0), Some(&cold));
         // Stopped at a gradient of 1e-6, or after 60 iterations, on a system whose damping keeps its condition <= 1e4.
         for (a, b) in cold.iter().zip(&warm) {
             assert!((a - b).abs() < 2e-2, "{a} {b}");

@@ -23,7 +23,7 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
 /// writes `A v`. The best x found is kept either way.
 pub fn solve(product: impl Fn(&[f64], &mut [f64]), b: &[f64], x: &mut [f64], tolerance: f64, limit: usize) -> Solved {
     let scale = dot(b, b).sqrt();
-    if !(scale > 0.0) {
+    if scale == 0.0 {
         x.fill(0.0);
         return Solved { iterations: 0, residual: 0.0 };
     }
@@ -33,7 +33,9 @@ pub fn solve(product: impl Fn(&[f64], &mut [f64]), b: &[f64], x: &mut [f64], tol
         product(x, &mut work);
         let mut first: Vec<f64> = b.iter().zip(&work).map(|(b, a)| b - a).collect();
         let norm = dot(&first, &first).sqrt();
-        if !(norm > tolerance * scale) || iterations >= limit {
+        // NaN ends here too.
+        let unfinished = norm > tolerance * scale && iterations < limit;
+        if !unfinished {
             return Solved { iterations, residual: norm / scale };
         }
         first.iter_mut().for_each(|v| *v /= norm);
@@ -58,7 +60,7 @@ pub fn solve(product: impl Fn(&[f64], &mut [f64]), b: &[f64], x: &mut [f64], tol
             }
             let length = column[k].hypot(next);
             // A zero column: the matrix is singular on this space, and the cycle ends with what it has.
-            if !(length > 0.0) {
+            if length == 0.0 {
                 break;
             }
             let (c, s) = (column[k] / length, next / length);

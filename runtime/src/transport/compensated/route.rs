@@ -4,13 +4,13 @@
 //! transport's matrix) is kept, so that an edit of light, albedo or g costs the single scattering and one solve.
 
 use crate::medium::gaussian_points::{GaussianError, GaussianPoints};
-use crate::sphere::harmonics::MAX_ORDER;
+use crate::sphere::harmonics::{MAX_COEFFICIENTS, MAX_ORDER, limit_to_positive};
 use crate::sphere::quadrature::Directions;
 use crate::transport::compensated::centres::{
     Basis, CentreRadiance, IncidentRadiance, evaluate_depth, gains, scatter_directions, scatter_harmonics,
 };
 use crate::transport::compensated::depth::{DirectionalDepth, harmonic_depth};
-use crate::transport::compensated::diffusion::Diffusion;
+use crate::transport::compensated::diffusion::{Channel, Diffusion};
 use crate::transport::compensated::exponential::Exponential;
 use crate::transport::compensated::integral::IntegralTransport;
 use crate::transport::compensated::overlap::OverlapGrid;
@@ -133,7 +133,8 @@ impl CentreTransport {
         &self.points
     }
 
-    /// Source radiance at the centres.
+    /// Source radiance at the centres, limited to what light of this strength can cause: J is positive, and its mean is at
+    /// most albedo times the brightest light.
     ///
     /// `unit_length_world` is the length of unit space's 1 in world units. `start`, an earlier result for the same number
     /// of Gaussians, makes a solve after a small edit shorter; it never changes what is solved for.
@@ -175,8 +176,8 @@ impl CentreTransport {
                 let brightest = sampled[c].iter().copied().fold(0.0, f32::max);
                 let before: Option<Vec<f32>> =
                     start.filter(|s| s.level.len() == n).map(|s| s.level.iter().map(|l| l[c]).collect());
-                let level =
-                    diffusion.add(&mut out.coefficients, order, c, scale[c], &banded, brightest, before.as_deref());
+                let channel = Channel { index: c, optical_scale: scale[c], brightest };
+                let level = diffusion.add(&mut out.coefficients, order, &banded, channel, before.as_deref());
                 out.level.iter_mut().zip(level).for_each(|(out, l)| out[c] = l);
             }
         }
@@ -193,6 +194,15 @@ impl CentreTransport {
                 });
                 let start = start.map(|s| &s.coefficients[..]);
                 self.matrices[at].1.add(&mut out.coefficients, order, c, &gains(&banded, c), start);
+            }
+        }
+        for c in 0..3 {
+            let largest = banded.albedo[c] * sampled[c].iter().copied().fold(0.0, f32::max);
+            for j in out.coefficients.chunks_exact_mut(order * order) {
+                let mut coefficients = [0.0; MAX_COEFFICIENTS];
+                coefficients.iter_mut().zip(j.iter()).for_each(|(k, j)| *k = j[c]);
+                limit_to_positive(&mut coefficients[..order * order], largest);
+                j.iter_mut().zip(coefficients).for_each(|(j, k)| j[c] = k);
             }
         }
         Ok(out)
@@ -254,7 +264,7 @@ mod tests {
                             for j in j.coefficients.chunks(order * order) {
                                 assert!(j.iter().flatten().all(|v| v.is_finite()));
                                 assert!(
-                                    j[0].iter().all(|&v| (0.0..2.02 * ROOT).contains(&v)),
+                                    j[0].iter().all(|&v| (0.0..1.0001 * ROOT).contains(&v)),
                                     "{settings:?} {sigma_t} {albedo} {g}: {:?}",
                                     j[0]
                                 );

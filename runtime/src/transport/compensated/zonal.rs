@@ -55,7 +55,7 @@ pub fn ray_depth(d: f64, mu: f64) -> f64 {
 
 /// `G(k/2)` for k > 0.
 fn gamma_half(k: usize) -> f64 {
-    let (mut value, mut at) = if k % 2 == 0 { (1.0, 2) } else { (PI.sqrt(), 1) };
+    let (mut value, mut at) = if k.is_multiple_of(2) { (1.0, 2) } else { (PI.sqrt(), 1) };
     while at < k {
         value *= at as f64 / 2.0;
         at += 2;
@@ -213,8 +213,8 @@ mod tests {
         for i in 0..4000 {
             let d = if i < 2000 { f64::from(i) * 0.005 } else { 10.0 * 1.0125f64.powi(i - 2000) };
             let found = table.depth(d as f32);
-            for l in 0..MAX_ORDER {
-                let error = (f64::from(found[l]) - zonal_depth(l, f64::from(d as f32))).abs() / zonal_depth(0, d);
+            for (l, &found) in found.iter().enumerate().take(MAX_ORDER) {
+                let error = (f64::from(found) - zonal_depth(l, f64::from(d as f32))).abs() / zonal_depth(0, d);
                 worst = worst.max(error);
             }
             assert_eq!(found[MAX_ORDER..], [0.0, 0.0]);
