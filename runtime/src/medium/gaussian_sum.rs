@@ -450,8 +450,14 @@ mod tests {
         let lattice = Lattice { space: UnitSpace::of_box([0; 3], [70, 30, 30]), origin: [0; 3], dims: [70, 30, 30] };
         let mut field = vec![[0.0f32; LANES]; lattice.slice_blocks() * 30];
         // Values in the padding must not be seen.
-        field.as_flattened_mut().iter_mut().enumerate().for_each(|(i, v)| *v = ((i * 7919) % 1000) as f32 / 500.0 - 1.0);
-        for g in [gaussian([0.5, 0.2, 0.2], 0.09, 1.0), gaussian([0.97, 0.4, 0.1], 0.05, 1.0), gaussian([0.0; 3], 0.3, 1.0)] {
+        field
+            .as_flattened_mut()
+            .iter_mut()
+            .enumerate()
+            .for_each(|(i, v)| *v = ((i * 7919) % 1000) as f32 / 500.0 - 1.0);
+        for g in
+            [gaussian([0.5, 0.2, 0.2], 0.09, 1.0), gaussian([0.97, 0.4, 0.1], 0.05, 1.0), gaussian([0.0; 3], 0.3, 1.0)]
+        {
             let mut kernel = Kernel::default();
             kernel.place(&lattice, g.center.map(f64::from), f64::from(g.radius));
             let found = moments(&kernel, &field, &lattice);
