@@ -3,7 +3,8 @@
 //! Each option's variable and settings key come from its long name (see `layers`). A subcommand is in [`Command`] when
 //! there is an engine behind it; the options of the others stand ready below.
 
-use clap::{ArgAction, Args, Parser, Subcommand, ValueEnum};
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use smoke_formats::sequence::FrameSelection;
 use std::path::PathBuf;
 
 const LAYERS_HELP: &str = "\
@@ -26,6 +27,12 @@ pub struct Cli {
 pub enum Command {
     /// Measure how far an image is from a reference: RMSE, PSNR, bias, largest error.
     Compare(CompareArgs),
+    /// Show what a pack holds: sequence, settings, and sizes, errors and seconds of every frame.
+    Inspect(InspectArgs),
+    /// Check every byte of a pack and name the first thing that is wrong.
+    Validate(ValidateArgs),
+    /// Decode a pack's frames to OpenVDB or Mitsuba volumes.
+    Unpack(UnpackArgs),
 }
 
 /// Options of `compare`.
@@ -251,14 +258,20 @@ pub struct UnpackArgs {
     /// The pack.
     pub pack: PathBuf,
     /// The volumes to write, such as out.####.vdb or out.####.vol.
-    #[arg(short, long, value_name = "PATTERN")]
+    #[arg(short, long, value_name = "PATTERN", value_parser = volume_pattern)]
     pub output: PathBuf,
     /// Frames to unpack [default: all in the pack].
     #[arg(long, value_name = "RANGE")]
-    pub frames: Option<String>,
-    /// Store densities in 16 bits instead of 32 (VDB).
-    #[arg(long, action = ArgAction::SetTrue)]
+    pub frames: Option<FrameSelection>,
+    /// Store densities in 16 bits instead of 32 (VDB only); the error that this adds is reported.
+    #[arg(long)]
     pub half: bool,
+    /// Threads; the result does not depend on it [default: one for each core].
+    #[arg(long, value_name = "N")]
+    pub threads: Option<usize>,
+    /// How progress is shown.
+    #[arg(long, value_enum, default_value_t)]
+    pub progress: ProgressMode,
 }
 
 /// Options of `demo`.
@@ -293,6 +306,14 @@ fn difference_path(text: &str) -> Result<PathBuf, String> {
     }
 }
 
+fn volume_pattern(text: &str) -> Result<PathBuf, String> {
+    let path = PathBuf::from(text);
+    match path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase).as_deref() {
+        Some("vdb" | "vol") => Ok(path),
+        _ => Err("expected a name that ends in .vdb or .vol".into()),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -304,9 +325,6 @@ mod tests {
         let all = clap::Command::new("all");
         all.subcommand(BakeArgs::augment_args(clap::Command::new("bake")))
             .subcommand(RenderArgs::augment_args(clap::Command::new("render")))
-            .subcommand(InspectArgs::augment_args(clap::Command::new("inspect")))
-            .subcommand(ValidateArgs::augment_args(clap::Command::new("validate")))
-            .subcommand(UnpackArgs::augment_args(clap::Command::new("unpack")))
             .subcommand(DemoArgs::augment_args(clap::Command::new("demo")))
             .debug_assert();
     }

@@ -6,9 +6,15 @@ mod compare;
 #[cfg_attr(not(test), expect(dead_code, reason = "`demo` shows its frames with it"))]
 mod contact_sheet;
 mod failure;
+mod inspect;
 mod layers;
-#[cfg_attr(not(test), expect(dead_code, reason = "`bake` and `render` report through it"))]
 mod progress;
+#[cfg_attr(not(test), expect(dead_code, reason = "`bake` writes through it"))]
+mod seconds;
+#[cfg(test)]
+mod testing;
+mod unpack;
+mod validate;
 
 use clap::FromArgMatches;
 use cli::{Cli, Command};
@@ -29,5 +35,8 @@ fn run() -> Result<(), Failure> {
     let matches = command.try_get_matches()?;
     match Cli::from_arg_matches(&matches)?.command {
         Command::Compare(args) => compare::run(&args),
+        Command::Inspect(args) => inspect::run(&args),
+        Command::Validate(args) => validate::run(&args),
+        Command::Unpack(args) => unpack::run(&args),
     }
 }

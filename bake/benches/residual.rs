@@ -1,7 +1,6 @@
 //! Time per stage of the residual, for a frame of about 250 k voxels and a tile of 27 of them.
 //!
-//! `cargo bench -p smoke-baking --bench residual`; user seconds of one core of an AMD EPYC at 2.x GHz are in the
-//! module heads. The frame is a ball of waves: as smooth as smoke, and made in a moment.
+//! `cargo bench -p smoke-baking --bench residual`. The frame is a ball of waves: as smooth as smoke, and made in a moment.
 
 use divan::Bencher;
 use smoke_baking::residual::perfect_hash::find;

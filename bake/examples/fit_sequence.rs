@@ -1,32 +1,62 @@
-//! try
-use smoke_baking::fit::{frame::*, objective::Scope};
-use smoke_formats::{gaussian::UnitSpace, volume::{DensityGrid, VoxelMask}};
-fn env(k: &str, d: f64) -> f64 { std::env::var(k).ok().map_or(d, |s| s.parse().unwrap()) }
-fn main() {
-    let mut grids = Vec::new();
-    for path in std::env::args().skip(1) {
-        let b = std::fs::read(&path).unwrap();
-        let w: Vec<u32> = b.chunks(4).map(|c| u32::from_le_bytes(c.try_into().unwrap())).collect();
-        let values: Vec<f32> = w[6..].iter().map(|&b| f32::from_bits(b)).collect();
-        grids.push(DensityGrid { name: path, origin: [w[3] as i32, w[4] as i32, w[5] as i32], dims: [w[0], w[1], w[2]].map(|d| d as usize), active: VoxelMask::new(values.len()), values, world_from_index: Default::default() });
-    }
-    let lo: [i32; 3] = std::array::from_fn(|a| grids.iter().map(|g| g.origin[a]).min().unwrap());
-    let hi: [i32; 3] = std::array::from_fn(|a| grids.iter().map(|g| g.origin[a] + g.dims[a] as i32).max().unwrap());
-    let space = UnitSpace::of_box(lo, std::array::from_fn(|a| (hi[a] - lo[a]) as u32));
-    let d = FitSettings::default();
-    let settings = FitSettings { gaussians: env("N", 600.) as usize, first_evaluations: env("EV", 200.) as usize, next_evaluations: env("NEV", 40.) as usize, memory: env("M", 20.) as usize,
-        error_ratio: env("RHO", 1.1), scope: if env("SUP", 0.) > 0. { Scope::Support } else { Scope::Box }, deletions: env("DEL", 3.) as usize, teleport_every: env("TE", 20.) as u64, steady: env("ST", 1.) > 0., ..d };
-    let (mut previous, mut first): (Vec<_>, f64) = (Vec::new(), 0.0);
-    let start = std::time::Instant::now();
-    let (mut sum, mut worst, mut sup) = (0.0, 0.0f64, 0.0);
-    for (i, g) in grids.iter().enumerate() {
-        let t = std::time::Instant::now();
-        let fit = if i == 0 { fit_first(g, &space, &settings, &mut |_| ()) } else { fit_next(g, &space, &previous, first, &settings, &mut |_| ()) }.unwrap();
-        if i == 0 { first = fit.fit_error; }
-        sum += fit.fit_error; worst = worst.max(fit.fit_error); sup += fit.support_error;
-        if i % 8 == 0 || i + 1 == grids.len() { println!("{} n {} error {:.5} support {:.5} ev {} it {} tel {} ins {} del {} {:.3}s", &g.name[g.name.len()-8..], fit.gaussians.len(), fit.fit_error, fit.support_error, fit.evaluations, fit.iterations, fit.teleports, fit.inserted, fit.deleted, t.elapsed().as_secs_f64()); }
+//! Fits a sequence of raw volumes and prints one line a frame: `fit_sequence N VOLUME...`.
+//!
+//! A raw volume holds three little-endian u32 sides, three i32 indices of the first voxel, then f32 values, x fastest.
+
+use smoke_baking::fit::frame::{FitSettings, fit_first, fit_next};
+use smoke_formats::gaussian::UnitSpace;
+use smoke_formats::volume::{DensityGrid, VoxelMask};
+use std::time::Instant;
+
+type Failure = Box<dyn std::error::Error>;
+
+fn read(path: &str) -> Result<DensityGrid, Failure> {
+    let bytes = std::fs::read(path)?;
+    let words: Vec<u32> = bytes.as_chunks::<4>().0.iter().map(|&word| u32::from_le_bytes(word)).collect();
+    let [nx, ny, nz, ox, oy, oz, values @ ..] = &words[..] else { return Err(format!("{path}: no sides").into()) };
+    let values: Vec<f32> = values.iter().map(|&bits| f32::from_bits(bits)).collect();
+    Ok(DensityGrid {
+        name: path.into(),
+        origin: [*ox, *oy, *oz].map(|o| o as i32),
+        dims: [*nx, *ny, *nz].map(|d| d as usize),
+        active: VoxelMask::new(values.len()),
+        values,
+        world_from_index: Default::default(),
+    })
+}
+
+fn main() -> Result<(), Failure> {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let [n, paths @ ..] = &arguments[..] else { return Err("usage: fit_sequence N VOLUME...".into()) };
+    let grids = paths.iter().map(|p| read(p)).collect::<Result<Vec<_>, _>>()?;
+    let low: [i32; 3] = std::array::from_fn(|a| grids.iter().map(|g| g.origin[a]).min().unwrap_or(0));
+    let high: [i32; 3] =
+        std::array::from_fn(|a| grids.iter().map(|g| g.origin[a] + g.dims[a] as i32).max().unwrap_or(0));
+    let space = UnitSpace::of_box(low, std::array::from_fn(|a| (high[a] - low[a]) as u32));
+    let settings = FitSettings { gaussians: n.parse()?, ..FitSettings::default() };
+    let (mut previous, mut first, mut sum, start) = (Vec::new(), None, 0.0, Instant::now());
+    for grid in &grids {
+        let began = Instant::now();
+        let fit = match first {
+            None => fit_first(grid, &space, &settings, &mut |_| ())?,
+            Some(first) => fit_next(grid, &space, &previous, first, &settings, &mut |_| ())?,
+        };
+        first.get_or_insert(fit.fit_error);
+        sum += fit.fit_error;
+        println!(
+            "{} {} Gaussians, error {:.5}, on the support {:.5}, {} evaluations, {} moved, {} new, {} deleted, {:.3} s",
+            grid.name,
+            fit.gaussians.len(),
+            fit.fit_error,
+            fit.support_error,
+            fit.evaluations,
+            fit.teleports,
+            fit.inserted,
+            fit.deleted,
+            began.elapsed().as_secs_f64()
+        );
         previous = fit.gaussians;
     }
-    let n = grids.len() as f64;
-    println!("mean error {:.5} worst {worst:.5} support {:.5} {:.3} s/frame", sum / n, sup / n, start.elapsed().as_secs_f64() / n);
+    let frames = grids.len().max(1) as f64;
+    println!("mean error {:.5}, {:.3} s a frame", sum / frames, start.elapsed().as_secs_f64() / frames);
+    Ok(())
 }

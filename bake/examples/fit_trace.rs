@@ -14,7 +14,9 @@ use smoke_formats::volume::{DensityGrid, VoxelMask};
 
 type Failure = Box<dyn std::error::Error>;
 
-struct Function(fn(&[f64], &mut [f64]) -> f64);
+type Cost = fn(&[f64], &mut [f64]) -> f64;
+
+struct Function(Cost);
 
 impl CostGradient for Function {
     fn cost_gradient(&self, x: &[f64], gradient: &mut [f64]) -> f64 {
@@ -42,7 +44,7 @@ fn paired_rosenbrock(x: &[f64], g: &mut [f64]) -> f64 {
 fn function(name: &str, n: usize, evaluations: usize) -> Result<Vec<(usize, f64)>, Failure> {
     let free = || (vec![f64::NEG_INFINITY; n], vec![f64::INFINITY; n]);
     let odd = |even: f64, odd: f64| (0..n).map(|i| if i % 2 == 0 { even } else { odd }).collect::<Vec<f64>>();
-    let (f, start, (lower, upper)): (fn(&[f64], &mut [f64]) -> f64, _, _) = match name {
+    let (f, start, (lower, upper)): (Cost, _, _) = match name {
         "rosenbrock" => (rosenbrock, odd(-1.2, 1.0), free()),
         "bounded_rosenbrock" => (rosenbrock, vec![3.0; n], (odd(1.5, -100.0), vec![100.0; n])),
         "paired_rosenbrock" => (paired_rosenbrock, odd(-1.2, 1.0), free()),
@@ -60,7 +62,8 @@ fn function(name: &str, n: usize, evaluations: usize) -> Result<Vec<(usize, f64)
         trace.push((result.solver.evaluations(), result.state.cost));
         let done = result.state.iter == 0 || result.solver.evaluations() >= evaluations;
         let lost = || Failure::from("the state lost its point");
-        at = (result.state.take_param().ok_or_else(lost)?, result.state.take_gradient().map(|g| (g, result.state.cost)));
+        at =
+            (result.state.take_param().ok_or_else(lost)?, result.state.take_gradient().map(|g| (g, result.state.cost)));
         solver = result.solver;
         if done {
             return Ok(trace);

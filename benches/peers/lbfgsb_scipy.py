@@ -71,7 +71,8 @@ def evaluate(x, density, h, energy):
                     m3 += s * a0 * uz
                     m4 += s * (a2 + a0 * (uy * uy + uz * uz))
         f = 4 * x[5 * g + 4] / x[5 * g + 3] / energy
-        gradient[5 * g:5 * g + 5] = f * m1, f * m2, f * m3, f * m4, 2 * m0 / energy
+        gradient[5 * g], gradient[5 * g + 1], gradient[5 * g + 2] = f * m1, f * m2, f * m3
+        gradient[5 * g + 3], gradient[5 * g + 4] = f * m4, 2 * m0 / energy
     return cost, gradient
 
 def rosenbrock(x):
@@ -104,16 +105,17 @@ def scipy_best(f, start, bounds, evaluations, memory):
 
 def ours(arguments):
     trace = json.loads(subprocess.run([str(a) for a in arguments], check=True, capture_output=True, text=True).stdout)
-    return trace[-1][1], trace[-1][0]
+    return trace[-1][1], trace[-1][0], trace
 
 def main():
     program, volumes = sys.argv[1], sys.argv[2:]
     worse = 0
-    print("| problem | evaluations allowed | ours | SciPy |\n|---|---|---|---|")
+    print("| problem | evaluations allowed | ours | SciPy | ours reaches SciPy's end after |\n|---|---|---|---|---|")
     def row(name, evaluations, mine, theirs, floor=0.0):
         nonlocal worse
         worse += not mine[0] <= max(theirs[0] * 1.001, floor)
-        print(f"| {name} | {evaluations} | {mine[0]:.6g} after {mine[1]} | {theirs[0]:.6g} after {theirs[1]} |", flush=True)
+        level = next((n for n, cost in mine[2] if cost <= theirs[0] * 1.000001), "-")
+        print(f"| {name} | {evaluations} | {mine[0]:.6g} after {mine[1]} | {theirs[0]:.6g} after {theirs[1]} | {level} |", flush=True)
     start = lambda n: np.where(np.arange(n) % 2 == 0, -1.2, 1.0)
     for name, n, f, x, bounds in [
         ("rosenbrock", 2, rosenbrock, start(2), None),

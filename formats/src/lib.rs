@@ -7,6 +7,7 @@
 pub mod atomic;
 pub mod bounded;
 pub mod error;
+mod frame_selection;
 pub mod gaussian;
 pub mod image;
 pub mod mitsuba_vol;

@@ -35,7 +35,11 @@ pub fn read_bytes(path: &Path, bytes: &[u8]) -> Result<DensityGrid> {
     let mut bytes = Bytes::new(path, bytes);
     let magic = bytes.take(4, "magic number and version")?;
     if magic != MAGIC {
-        return Err(bytes.invalid("magic number and version", format!("{magic:02x?}"), format!("{MAGIC:02x?} (VOL 3)")));
+        return Err(bytes.invalid(
+            "magic number and version",
+            format!("{magic:02x?}"),
+            format!("{MAGIC:02x?} (VOL 3)"),
+        ));
     }
     let encoding = bytes.i32("encoding")?;
     let value_bytes = match encoding {
@@ -95,7 +99,8 @@ fn to_bytes(path: &Path, grid: &DensityGrid) -> Result<Vec<u8>> {
     }
     let map = &grid.world_from_index;
     let step = DVec3::new(map.matrix3.x_axis.x, map.matrix3.y_axis.y, map.matrix3.z_axis.z);
-    if map.matrix3 != DMat3::from_diagonal(step) || !(step.min_element() > 0.0) {
+    let upright = map.matrix3 == DMat3::from_diagonal(step) && step.min_element() > 0.0;
+    if !upright {
         let hint = "resample the grid to upright voxels, or write OpenVDB";
         return Err(Error::unsupported(path, "transform to write", format!("{:?}", map.matrix3), hint));
     }
@@ -140,7 +145,8 @@ mod tests {
         // Every corner is a short binary fraction: nothing is rounded.
         let grid = read_bytes(Path::new("a.vol"), &bytes()).unwrap();
         assert_eq!(grid, sample());
-        let corners: Vec<f32> = bytes()[24..48].chunks_exact(4).map(|c| f32::from_le_bytes(c.try_into().unwrap())).collect();
+        let corners: Vec<f32> =
+            bytes()[24..48].chunks_exact(4).map(|c| f32::from_le_bytes(c.try_into().unwrap())).collect();
         assert_eq!(corners, [1.0, 2.0, -0.875, 2.0, 5.0, 0.125]);
     }
 
@@ -161,8 +167,16 @@ mod tests {
         let good = bytes();
         (0..good.len()).for_each(|end| assert!(read_bytes(Path::new("a"), &good[..end]).is_err(), "prefix {end}"));
         assert!(read_bytes(Path::new("a"), &[&good[..], &[0]].concat()).is_err());
-        for (at, byte, what) in [(0, b'W', "magic"), (3, 2, "magic"), (4, 4, "encoding"), (8, 0, "along x"), (15, 255, "along y"),
-                                 (20, 3, "channels"), (47, 255, "bounding box"), (11, 127, "values")] {
+        for (at, byte, what) in [
+            (0, b'W', "magic"),
+            (3, 2, "magic"),
+            (4, 4, "encoding"),
+            (8, 0, "along x"),
+            (15, 255, "along y"),
+            (20, 3, "channels"),
+            (47, 255, "bounding box"),
+            (11, 127, "values"),
+        ] {
             let mut bad = good.clone();
             bad[at] = byte;
             let message = read_bytes(Path::new("a.vol"), &bad).unwrap_err().to_string();
@@ -172,7 +186,9 @@ mod tests {
 
     #[test]
     fn a_turned_a_mirrored_and_an_empty_grid_cannot_be_written() {
-        let write = |matrix3| to_bytes(Path::new("a"), &DensityGrid { world_from_index: DAffine3::from_mat3(matrix3), ..sample() });
+        let write = |matrix3| {
+            to_bytes(Path::new("a"), &DensityGrid { world_from_index: DAffine3::from_mat3(matrix3), ..sample() })
+        };
         assert!(write(DMat3::from_rotation_z(0.1)).is_err());
         assert!(write(DMat3::from_diagonal(DVec3::new(1.0, -1.0, 1.0))).is_err());
         assert!(write(DMat3::from_diagonal(DVec3::splat(1e300))).is_err());

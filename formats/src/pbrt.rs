@@ -162,7 +162,12 @@ impl<'a> Tokens<'a> {
             b'"' => {
                 let end = until(start + 1, |b| b == b'"');
                 if end == bytes.len() {
-                    return Err(Error::invalid(self.path, "pbrt text", format!("an open quote at byte {start}"), "its end"));
+                    return Err(Error::invalid(
+                        self.path,
+                        "pbrt text",
+                        format!("an open quote at byte {start}"),
+                        "its end",
+                    ));
                 }
                 self.at = end + 1;
                 Token::Quoted(&self.text[start + 1..end])
@@ -183,9 +188,8 @@ impl<'a> Tokens<'a> {
     /// The numbers of one parameter: one alone, or a list in brackets.
     fn values<T: std::str::FromStr>(&mut self, name: &str) -> Result<Vec<T>> {
         let path = self.path;
-        let parse = |number: &str| {
-            number.parse().map_err(|_| Error::invalid(path, name, number.escape_debug(), "a number"))
-        };
+        let parse =
+            |number: &str| number.parse().map_err(|_| Error::invalid(path, name, number.escape_debug(), "a number"));
         match self.next()? {
             Some(Token::Number(number)) => return Ok(vec![parse(number)?]),
             Some(Token::Open) => {}

@@ -8,7 +8,8 @@
 use crate::{Error, Result};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::str::FromStr;
+
+pub use crate::frame_selection::{FrameSelection, FrameSelectionError};
 
 /// One frame of a sequence.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -59,7 +60,12 @@ impl Sequence {
         }
         if !is_file {
             std::fs::metadata(path).map_err(|e| Error::io(path, e))?;
-            return Err(Error::invalid(path, "sequence", "a folder or a device", "a file, or a pattern such as plume.####.vdb"));
+            return Err(Error::invalid(
+                path,
+                "sequence",
+                "a folder or a device",
+                "a file, or a pattern such as plume.####.vdb",
+            ));
         }
         if let Some((name, number)) = NamePattern::from_member(&folder, file_name)? {
             let frames = name.frames(path)?;
@@ -94,8 +100,8 @@ impl Sequence {
     /// The frames of a selection, ascending, each once. A frame asked for that is missing is an error naming it.
     pub fn select(&self, selection: &FrameSelection) -> Result<Vec<SequenceFrame>> {
         let mut chosen = BTreeMap::new();
-        for range in &selection.ranges {
-            for number in (range.first..=range.last).step_by(range.step as usize) {
+        for range in selection.ranges() {
+            for number in range.numbers() {
                 // The first missing frame ends it, so that a huge range costs no more than the frames that are there.
                 let Ok(at) = self.frames.binary_search_by_key(&number, |f| f.number) else {
                     let there = format!("{} to {}", self.frames[0].number, self.frames[self.frames.len() - 1].number);
@@ -107,6 +113,34 @@ impl Sequence {
             }
         }
         Ok(chosen.into_values().collect())
+    }
+}
+
+/// The file of each frame of a sequence that is to be written.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct OutputNames(NamePattern);
+
+impl OutputNames {
+    /// The names that `pattern` gives `frames` files; one file may have a name without a pattern.
+    ///
+    /// Errors: several frames and no pattern, two patterns, no file name.
+    pub fn new(pattern: &Path, frames: usize) -> Result<Self> {
+        let folder = pattern.parent().map(Path::to_owned).unwrap_or_default();
+        let name = pattern.file_name().and_then(|n| n.to_str());
+        let expected = "a UTF-8 file name with a pattern, such as out.####.exr";
+        let name = name.ok_or_else(|| Error::invalid(pattern, "output", "no UTF-8 file name", expected))?;
+        match NamePattern::from_placeholder(pattern, &folder, name)? {
+            Some(names) => Ok(Self(names)),
+            None if frames <= 1 => {
+                Ok(Self(NamePattern { folder, prefix: name.to_owned(), width: 0, suffix: String::new() }))
+            }
+            None => Err(Error::invalid(pattern, "output", format!("one name for {frames} frames"), expected)),
+        }
+    }
+
+    /// The file of frame `number`.
+    pub fn path(&self, number: i32) -> PathBuf {
+        self.0.folder.join(self.0.file_name(number))
     }
 }
 
@@ -133,7 +167,12 @@ impl NamePattern {
             return Ok(None);
         }
         let &[(start, end, width)] = found.as_slice() else {
-            return Err(Error::invalid(path, "sequence", format!("{} patterns", found.len()), "one, such as plume.####.vdb"));
+            return Err(Error::invalid(
+                path,
+                "sequence",
+                format!("{} patterns", found.len()),
+                "one, such as plume.####.vdb",
+            ));
         };
         let (prefix, suffix) = (name[..start].to_owned(), name[end..].to_owned());
         Ok(Some(Self { folder: folder.to_owned(), prefix, width, suffix }))
@@ -150,7 +189,8 @@ impl NamePattern {
         let mut pattern = Self { folder, prefix: prefix.to_owned(), width: 1, suffix };
         let padded = |d: &str| d.len() > 1 && d.starts_with('0');
         let siblings = pattern.names()?;
-        let any_padded = siblings.iter().filter_map(|n| pattern.digits(n)).any(|d| d.len() == digits.len() && padded(d));
+        let any_padded =
+            siblings.iter().filter_map(|n| pattern.digits(n)).any(|d| d.len() == digits.len() && padded(d));
         if padded(digits) || any_padded {
             pattern.width = digits.len();
         }
@@ -254,7 +294,8 @@ fn placeholders(name: &str) -> Vec<(usize, usize, usize)> {
 
 /// Start and end of the digits that number a file's frame.
 fn frame_digits(name: &str) -> Option<(usize, usize)> {
-    let stem = name.rfind('.').filter(|&dot| name[dot + 1..].bytes().any(|b| !b.is_ascii_digit())).unwrap_or(name.len());
+    let stem =
+        name.rfind('.').filter(|&dot| name[dot + 1..].bytes().any(|b| !b.is_ascii_digit())).unwrap_or(name.len());
     let bytes = &name.as_bytes()[..stem];
     let mut runs = Vec::new();
     let mut at = 0;
@@ -268,72 +309,6 @@ fn frame_digits(name: &str) -> Option<(usize, usize)> {
     let set_off = |at: usize| at == 0 || matches!(bytes[at - 1], b'.' | b'_' | b'-');
     runs.retain(|&(start, _)| !(start > 0 && matches!(bytes[start - 1], b'v' | b'V') && set_off(start - 1)));
     runs.iter().rfind(|r| set_off(r.0)).or(runs.last()).copied()
-}
-
-/// Which frames to take, such as `1001-1064`, `1001-1064x2`, `-3-5,10,20`.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct FrameSelection {
-    ranges: Vec<FrameRange>,
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct FrameRange {
-    first: i32,
-    last: i32,
-    step: u32,
-}
-
-/// Why a text is no frame selection.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("frames '{text}': {reason}")]
-pub struct FrameSelectionError {
-    text: String,
-    reason: String,
-}
-
-impl FromStr for FrameSelection {
-    type Err = FrameSelectionError;
-
-    fn from_str(text: &str) -> std::result::Result<Self, FrameSelectionError> {
-        let ranges = text.split(',').map(|item| range(item.trim()));
-        let ranges = ranges.collect::<std::result::Result<_, String>>();
-        let ranges = ranges.map_err(|reason| FrameSelectionError { text: text.escape_debug().to_string(), reason })?;
-        Ok(Self { ranges })
-    }
-}
-
-fn range(item: &str) -> std::result::Result<FrameRange, String> {
-    if item.contains(':') {
-        let hint = item.replacen(':', "x", 1);
-        return Err(format!("the step is written with x, such as {}", hint.escape_debug()));
-    }
-    let whole = |digits: &str, what: &str| {
-        let is_number = !digits.is_empty() && digits.bytes().all(|b| b.is_ascii_digit());
-        let number = is_number.then(|| digits.parse::<i64>().ok().filter(|&n| n <= i64::from(i32::MAX))).flatten();
-        number.ok_or_else(|| format!("'{}' where {what} was expected, such as in 1001-1064x2", digits.escape_debug()))
-    };
-    // A sign belongs to the number that follows it.
-    let signed = |text: &str| match text.strip_prefix('-') {
-        Some(digits) => whole(digits, "a frame").map(|n| -n as i32),
-        None => whole(text, "a frame").map(|n| n as i32),
-    };
-    let (frames, step) = match item.split_once('x') {
-        Some((frames, step)) => (frames, whole(step, "a step")? as u32),
-        None => (item, 1),
-    };
-    if step == 0 {
-        return Err("a step of 0 never ends; use 1 or more".to_owned());
-    }
-    let dash = frames.char_indices().skip(1).find(|&(_, c)| c == '-');
-    let (first, last) = match dash {
-        Some((at, _)) => (signed(&frames[..at])?, signed(&frames[at + 1..])?),
-        None if step == 1 => (signed(frames)?, signed(frames)?),
-        None => return Err("a step needs a first and a last frame, such as 1001-1064x2".to_owned()),
-    };
-    if last < first {
-        return Err(format!("{first}-{last} goes down; write {last}-{first}"));
-    }
-    Ok(FrameRange { first, last, step })
 }
 
 #[cfg(test)]
@@ -352,12 +327,46 @@ mod tests {
     }
 
     #[test]
+    fn files_to_write_are_named_by_every_pattern_and_a_plain_name_serves_one_frame() {
+        let named = |pattern: &str, number| OutputNames::new(Path::new(pattern), 3).map(|n| n.path(number));
+        for pattern in ["a/out.####.exr", "a/out.#.exr", "a/out.@@@@.exr", "a/out.%04d.exr", "a/out.$F4.exr"] {
+            assert_eq!(named(pattern, 7).unwrap(), Path::new("a/out.0007.exr"), "{pattern}");
+            assert_eq!(named(pattern, -7).unwrap(), Path::new("a/out.-0007.exr"), "{pattern}");
+            assert_eq!(named(pattern, 123_456).unwrap(), Path::new("a/out.123456.exr"), "{pattern}");
+        }
+        assert_eq!(OutputNames::new(Path::new("one.exr"), 1).unwrap().path(7), Path::new("one.exr"));
+        for (pattern, found) in [("one.exr", "one name for 3 frames"), ("##_##.exr", "2 patterns"), ("..", "no UTF-8")]
+        {
+            let message = named(pattern, 7).unwrap_err().to_string();
+            assert!(message.contains(found), "{message}");
+        }
+    }
+
+    #[test]
     fn every_pattern_and_every_member_finds_the_same_frames() {
-        let dir = folder(&["plume.0999.vdb", "plume.1000.vdb", "plume.1002.vdb", "plume.10000.vdb", "plume.-0001.vdb",
-                           "plume.7.vdb", "plume.01000.vdb", "plume.vdb", "plume.1000.vdb.bak", "other.1001.vdb"]);
+        let dir = folder(&[
+            "plume.0999.vdb",
+            "plume.1000.vdb",
+            "plume.1002.vdb",
+            "plume.10000.vdb",
+            "plume.-0001.vdb",
+            "plume.7.vdb",
+            "plume.01000.vdb",
+            "plume.vdb",
+            "plume.1000.vdb.bak",
+            "other.1001.vdb",
+        ]);
         std::fs::create_dir(dir.path().join("plume.1001.vdb")).unwrap();
-        for name in ["plume.####.vdb", "plume.#.vdb", "plume.@@@@.vdb", "plume.%04d.vdb", "plume.$F4.vdb", "plume.1002.vdb",
-                     "plume.0999.vdb", "plume.-0001.vdb"] {
+        for name in [
+            "plume.####.vdb",
+            "plume.#.vdb",
+            "plume.@@@@.vdb",
+            "plume.%04d.vdb",
+            "plume.$F4.vdb",
+            "plume.1002.vdb",
+            "plume.0999.vdb",
+            "plume.-0001.vdb",
+        ] {
             assert_eq!(numbers(&dir, name), [-1, 999, 1000, 1002, 10000], "{name}");
         }
         assert_eq!(numbers(&dir, "plume.%d.vdb"), [7, 1000, 1002, 10000]);
@@ -416,26 +425,6 @@ mod tests {
             assert!(message.contains("no such file") && message.contains("p."), "{message}");
         }
         assert!(select("1-4").unwrap_err().to_string().contains("p.0003.vdb: frame 3"));
-    }
-
-    #[test]
-    fn texts_that_are_no_selection_say_why() {
-        for (text, why) in [
-            ("1001-1064:2", "such as 1001-1064x2"),
-            ("", "'' where a frame"),
-            ("1,,2", "'' where a frame"),
-            ("5-1", "write 1-5"),
-            ("1-5x0", "step of 0"),
-            ("5x2", "a first and a last"),
-            ("1-5x", "'' where a step"),
-            ("1-+5", "'+5'"),
-            ("all", "'all'"),
-            ("99999999999", "99999999999"),
-            ("1\u{e9}-5", "where a frame"),
-        ] {
-            let message = text.parse::<FrameSelection>().unwrap_err().to_string();
-            assert!(message.contains(why), "{text}: {message}");
-        }
     }
 
     #[test]

@@ -135,7 +135,7 @@ impl DensityGrid {
 
     /// Fails at the first voxel whose value is not a density: not finite, or below zero. `path` is named in the error.
     pub fn check_density(&self, path: &Path) -> Result<()> {
-        match self.values.iter().position(|&value| !(value >= 0.0 && value < f32::INFINITY)) {
+        match self.values.iter().position(|&value| !(0.0..f32::INFINITY).contains(&value)) {
             None => Ok(()),
             Some(v) => {
                 let what = format!("density of grid '{}' at voxel {:?}", self.name.escape_debug(), self.index(v));

@@ -55,7 +55,9 @@ mod tests {
         assert!(read(&path("a.pbrt"), "heat").unwrap_err().to_string().contains("density (float)"));
         std::fs::write(path("a.txt"), "hello").unwrap();
         std::fs::write(path("empty.vdb"), "").unwrap();
-        for (name, what) in [("a.txt", "kind of file"), ("empty.vdb", "magic number"), ("none.vdb", "none.vdb"), ("", "folder")] {
+        for (name, what) in
+            [("a.txt", "kind of file"), ("empty.vdb", "magic number"), ("none.vdb", "none.vdb"), ("", "folder")]
+        {
             let message = read(&path(name), "density").unwrap_err().to_string();
             assert!(message.contains(what), "{message}");
         }

@@ -57,8 +57,17 @@ impl<'a> Descent<'a> {
             .cost_tolerance(tolerance)
             .max_evaluations(evaluations)
             .first_step(0.5);
-        let mut new =
-            Self { objective, solver, units, x, gradient: Vec::new(), cost: 0.0, iterations: 0, finished: false, extra: 0 };
+        let mut new = Self {
+            objective,
+            solver,
+            units,
+            x,
+            gradient: Vec::new(),
+            cost: 0.0,
+            iterations: 0,
+            finished: false,
+            extra: 0,
+        };
         new.run(0)?;
         Ok(new)
     }
@@ -109,7 +118,8 @@ impl<'a> Descent<'a> {
         let mut gradient = vec![0.0; x.len()];
         let cost = self.objective.cost_gradient(&x, &mut gradient);
         self.extra += 1;
-        if !(cost < self.cost) {
+        let lower = cost < self.cost;
+        if !lower {
             return false;
         }
         (self.x, self.gradient, self.cost, self.finished) = (x, gradient, cost, false);
@@ -126,7 +136,8 @@ impl<'a> Descent<'a> {
         let mut gradient = vec![0.0; x.len()];
         let cost = self.objective.cost_gradient(&x, &mut gradient);
         self.extra += 1;
-        if !(cost < self.cost) {
+        let lower = cost < self.cost;
+        if !lower {
             return false;
         }
         (self.x, self.gradient, self.cost, self.finished) = (x, gradient, cost, false);

@@ -3,6 +3,7 @@
 //! [`quantise`] makes codes with a promised error, [`perfect_hash`] looks for a hash of a tile's codes, [`tile`] picks
 //! the layout.
 
+pub mod decibel;
 pub mod perfect_hash;
 pub mod quantise;
 pub mod tile;

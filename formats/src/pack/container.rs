@@ -102,7 +102,7 @@ impl Header {
         if header.file_bytes != file_bytes {
             return Err(head.invalid("header.file_bytes", header.file_bytes, format!("the {file_bytes} of the file")));
         }
-        let aligned = header.toc_offset >= HEADER_BYTES && header.toc_offset % ALIGNMENT == 0;
+        let aligned = header.toc_offset >= HEADER_BYTES && header.toc_offset.is_multiple_of(ALIGNMENT);
         if !aligned || header.toc_offset.checked_add(header.toc_bytes) != Some(file_bytes) {
             let found = format!("{} from {}", header.toc_bytes, header.toc_offset);
             return Err(head.invalid("header.toc_bytes", found, format!("aligned, to the end at {file_bytes}")));

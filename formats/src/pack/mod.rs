@@ -23,3 +23,8 @@ pub use reader::{FrameResidual, Pack};
 pub use records::{Codec, FrameRecord, Promise, ResidualKind, SequenceRecord, SettingsRecord};
 pub use validate::{Finding, validate, validate_bytes};
 pub use writer::{AtRest, FrameData, PackWriter, write};
+
+#[cfg(test)]
+mod damage_tests;
+#[cfg(test)]
+mod format_tests;

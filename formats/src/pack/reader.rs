@@ -5,8 +5,7 @@
 //! section is asked for. Every section's checksum is verified each time it is read.
 //!
 //! Files are read at positions rather than mapped: a map needs unsafe code, and a file that another process cuts short
-//! would end the program instead of giving an error. The copy costs about 0.1 ms a megabyte, against 1 ms for the checks
-//! and the upload.
+//! would end the program instead of giving an error. The one copy is small beside the checksum and the checks.
 
 use super::at_rest::{decode_hash, decode_rank, inflate};
 use super::container::{
@@ -134,6 +133,11 @@ impl Pack {
     /// Bytes of the file.
     pub fn file_bytes(&self) -> u64 {
         self.header.file_bytes
+    }
+
+    /// XXH3-64 of the table of contents, which holds the checksums of all sections: it tells packs apart.
+    pub fn checksum(&self) -> u64 {
+        self.header.toc_checksum
     }
 
     /// The table of contents.

@@ -1,6 +1,6 @@
 //! Frames in, a pack out, one pass, with no more than one tile of frames in memory.
 //!
-//! The header is written last, over a blank one, so that an unfinished file is never mistaken for a pack; [`write`] adds
+//! The header is written last, over a blank one, so that an unfinished file is never mistaken for a pack; [`write()`] adds
 //! a temporary file and a rename. The same input gives the same bytes: nothing here knows the time or the machine.
 
 use super::at_rest::{deflate, encode_hash, encode_rank};

@@ -4,10 +4,10 @@
 //! cell `c` sits at (c & 1, c >> 1 & 1, c >> 2); in a cell, voxel `b` at (b & 3, b >> 2 & 3, b >> 4). Both resident
 //! layouts use this order, which is part of the format.
 //!
-//! Why cells: a 4^3 cell's mask is one machine word, so a rank is one popcount. On three real frames (63 k, 162 k and
-//! 251 k voxels, step 1/250 of the maximum) one code width a 4^3 cell took 8.4, 7.8 and 7.7 bits a voxel in all,
-//! against 9.9, 9.4 and 9.3 for one width a brick, and 9.1 to 9.9 for slabs of one or two voxels. A plane predicted in
-//! each cell saved 0.2 to 0.6 bits of code and cost 0.5 bits for its slopes, so there is none.
+//! Why cells: a 4^3 cell's mask is one machine word, so a rank is one popcount. On the densities of three real frames
+//! (63 k, 162 k and 251 k voxels, step 1/250 of the maximum) one code width a 4^3 cell took 8.4, 7.8 and 7.7 bits a voxel
+//! in all, against 9.9, 9.4 and 9.3 for one width a brick, and 9.1 to 10.1 for slabs of one or two voxels. A plane
+//! predicted in each cell saved 0.2 to 0.6 bits of code and cost 0.5 bits for its slopes, so there is none.
 //!
 //! Cost: 64 row reads a brick plus one step a voxel of the support; 1 bit a voxel of extra memory for the ranks.
 

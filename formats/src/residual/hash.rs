@@ -23,14 +23,15 @@
 //!
 //! Cost: a lookup reads a table word, one to five words of the brick, three bytes of offset and one slot. On dense
 //! codes it is larger than [`super::rank`] (m^3 slots, about 8 bits of offsets a code, domain bits); it is the smaller
-//! one where few codes of the support differ from zero.
+//! one where few codes of the support differ from zero. On the real frames of [`super::rank`] it takes 31 to 36 bits a
+//! voxel at 59 dB and 22 to 29 at 47 dB, four times the rank layout.
 
 use super::brick::{Brick, bricks_of, cell_and_bit, for_each_brick, from_bricks, mask_at, overhang, word};
 use super::rank::EMPTY;
 use super::{MAX_CODE, ResidualCodes, voxels_of};
 use crate::bounded::{Bytes, MAX_DENSE_VOXELS};
 use crate::{Error, Result};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Frames of a tile, at most.
 pub const MAX_FRAMES: usize = 27;
@@ -224,6 +225,8 @@ struct Frame {
 #[derive(Clone, Debug)]
 pub struct HashView<B = Vec<u8>> {
     bytes: B,
+    /// Named in errors.
+    path: PathBuf,
     frames: Vec<Frame>,
     side: u32,
     offset_side: u32,
@@ -310,7 +313,16 @@ impl<B: AsRef<[u8]>> HashView<B> {
         if next != all.len() as u64 || total != keys {
             return wrong("hash.length", format!("{} bytes, {keys} codes", all.len()), format!("{next}, {total}"));
         }
-        Ok(Self { bytes, frames, side, offset_side, slot_bytes, offsets, slots: first_slot as usize })
+        Ok(Self {
+            bytes,
+            path: path.to_owned(),
+            frames,
+            side,
+            offset_side,
+            slot_bytes,
+            offsets,
+            slots: first_slot as usize,
+        })
     }
 
     /// Frames of the tile.
@@ -421,7 +433,7 @@ impl<B: AsRef<[u8]>> HashView<B> {
         match wrong.get() {
             Some(code) => {
                 let what = format!("hash.frames[{frame}].codes");
-                Err(Error::invalid(Path::new(""), what, code, format!("not zero, within ±{MAX_CODE}")))
+                Err(Error::invalid(&self.path, what, code, format!("not zero, within ±{MAX_CODE}")))
             }
             None => Ok(codes),
         }
@@ -602,7 +614,7 @@ pub(crate) mod tests {
         for at in (0..HEADER_BYTES + FRAME_BYTES * frames.len()).step_by(4) {
             for value in [0, 1, u32::MAX, 1 << 28, 1 << 31] {
                 let mut bad = bytes.clone();
-                bad[at..at + 4].copy_from_slice(&(value as u32).to_le_bytes());
+                bad[at..at + 4].copy_from_slice(&u32::to_le_bytes(value));
                 let origin = at >= HEADER_BYTES && (at - HEADER_BYTES) % FRAME_BYTES < 12;
                 assert!(bad == bytes || origin || view(bad).is_err(), "{at} {value}");
             }

@@ -57,7 +57,7 @@ const fn ln_table() -> [f32; LN_STEPS + 1] {
 }
 
 /// The logistic function; beyond |x| = 12 it stays at its value there. NaN gives the value at -12.
-#[inline]
+#[inline(always)]
 pub(super) fn squash(x: f32) -> f32 {
     static TABLE: [f32; 2 * RANGE * STEPS_PER_UNIT + 2] = SQUASH;
     let limit = RANGE as f32;
@@ -69,7 +69,7 @@ pub(super) fn squash(x: f32) -> f32 {
 }
 
 /// The natural logarithm of a positive normal number.
-#[inline]
+#[inline(always)]
 pub(super) fn ln(x: f32) -> f32 {
     static TABLE: [f32; LN_STEPS + 1] = LN;
     let bits = x.to_bits();

@@ -20,13 +20,13 @@ impl Counter {
     pub(super) const NEW: Self = Self { probability: 0.5, count: 0.0 };
 
     /// `stretch` of the probability.
-    #[inline]
+    #[inline(always)]
     pub(super) fn stretch(&self) -> f32 {
         ln(self.probability / (1.0 - self.probability))
     }
 
     /// Learns one decision; the step is `1 / (decisions so far + 1.5)`, the count stopping at `limit`.
-    #[inline]
+    #[inline(always)]
     pub(super) fn learn(&mut self, bit: bool, limit: f32) {
         // The target stays off 0 and 1, so that the stretched value is bounded by ln(4095) = 8.3.
         let target = if bit { 1.0 - 1.0 / 4096.0 } else { 1.0 / 4096.0 };
@@ -51,7 +51,7 @@ impl<const N: usize> Mixer<N> {
     }
 
     /// The mixed probability, still stretched, within +-[`LIMIT`].
-    #[inline]
+    #[inline(always)]
     pub(super) fn mix(&self, set: usize, inputs: &[f32; N]) -> f32 {
         let weights = &self.sets[set];
         let mut dot = 0.0;
@@ -62,7 +62,7 @@ impl<const N: usize> Mixer<N> {
     }
 
     /// Follows the gradient after the decision; `probability` is what the mixer had said.
-    #[inline]
+    #[inline(always)]
     pub(super) fn learn(&mut self, set: usize, inputs: &[f32; N], probability: f32, bit: bool) {
         let step = (f32::from(u8::from(bit)) - probability) * self.rate;
         let weights = &mut self.sets[set];
@@ -86,7 +86,7 @@ impl Refinement {
         Self { lines: vec![std::array::from_fn(|i| squash((i as f32 - 16.0) * 0.5)); contexts], rate }
     }
 
-    #[inline]
+    #[inline(always)]
     fn knot(stretched: f32) -> (usize, f32) {
         let at = (stretched + 8.0) * 2.0;
         let knot = at as usize;
@@ -94,7 +94,7 @@ impl Refinement {
     }
 
     /// The probability that the map gives; |stretched| < 8.
-    #[inline]
+    #[inline(always)]
     pub(super) fn refine(&self, context: usize, stretched: f32) -> f32 {
         let (knot, fraction) = Self::knot(stretched);
         let line = &self.lines[context];
@@ -102,12 +102,47 @@ impl Refinement {
     }
 
     /// Moves the two knots that were used towards the decision.
-    #[inline]
+    #[inline(always)]
     pub(super) fn learn(&mut self, context: usize, stretched: f32, bit: bool) {
         let (knot, fraction) = Self::knot(stretched);
         let target = f32::from(u8::from(bit));
         let line = &mut self.lines[context];
         line[knot] += (target - line[knot]) * (1.0 - fraction) * self.rate;
         line[knot + 1] += (target - line[knot + 1]) * fraction * self.rate;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_counter_approaches_the_share_of_yes() {
+        let mut counter = Counter::NEW;
+        (0..3000).for_each(|i| counter.learn(i % 4 == 0, 250.0));
+        // The last 250 decisions weigh most; their mean deviates by less than one decision in 250, twice over.
+        assert!((squash(counter.stretch()) - 0.25).abs() < 2.0 / 250.0);
+    }
+
+    #[test]
+    fn a_mixer_learns_to_trust_the_input_that_is_right() {
+        let mut mixer = Mixer::<2>::new(1, [0.5; 2], 0.02);
+        for i in 0..4000u32 {
+            let bit = i.wrapping_mul(2_654_435_761) >> 31 == 1;
+            let x = [if bit { 2.0 } else { -2.0 }, if i % 2 == 0 { 2.0 } else { -2.0 }];
+            let p = squash(mixer.mix(0, &x));
+            mixer.learn(0, &x, p, bit);
+        }
+        assert!(squash(mixer.mix(0, &[2.0, -2.0])) > 0.95 && squash(mixer.mix(0, &[-2.0, 2.0])) < 0.05);
+    }
+
+    #[test]
+    fn a_refinement_is_the_logistic_function_until_it_learns_otherwise() {
+        let mut refinement = Refinement::new(1, 0.02);
+        // Knots half a unit apart: h^2/8 max|f''| = 0.25 / 8 * 0.0963 = 0.003.
+        (-79..80).map(|i| i as f32 * 0.1).for_each(|x| assert!((refinement.refine(0, x) - squash(x)).abs() < 0.0031));
+        (0..1000).for_each(|i| refinement.learn(0, 1.25, i % 2 == 0));
+        assert!((refinement.refine(0, 1.25) - 0.5).abs() < 0.02);
+        assert!((refinement.refine(0, -3.0) - squash(-3.0)).abs() < 0.0031, "other knots stay");
     }
 }

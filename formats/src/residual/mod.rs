@@ -15,12 +15,14 @@ pub mod brick;
 mod code_model;
 pub mod coded;
 pub mod hash;
+mod earlier;
 mod least_squares;
 mod logistic;
 mod mixing;
 mod predict;
 mod range_coder;
 pub mod rank;
+mod ranks;
 mod support;
 mod sweep;
 
@@ -166,7 +168,7 @@ pub(crate) mod tests {
         }
 
         pub(crate) fn below(&mut self, n: u32) -> u32 {
-            (u64::from(self.next()) * u64::from(n) >> 32) as u32
+            ((u64::from(self.next()) * u64::from(n)) >> 32) as u32
         }
     }
 

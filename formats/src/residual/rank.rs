@@ -15,8 +15,10 @@
 //! every range of 24-bit codes fit. The rank of a voxel is the popcount of its cell's mask below it.
 //!
 //! Cost: a lookup reads the table, two words of the brick, one mask and one or two words of values, with four popcounts.
-//! Size on real frames of 63 k, 162 k and 251 k voxels at a step of 1/250 of the maximum, everything included:
-//! 8.4, 7.8 and 7.7 bits a voxel (the choice of cells: see [`super::brick`]). NanoVDB FpN: 18 to 22 bits.
+//! Encoding takes 5 ns a voxel of the support, checking and unpacking 12 ns.
+//! Size on real frames of 63 k, 162 k and 251 k voxels, less a smooth approximation (a blur of two voxels), everything
+//! included: 8.8, 8.1 and 7.8 bits a voxel at a step of 1/250 of the maximum (59 dB), 6.8, 6.1 and 5.9 bits at 47 dB.
+//! The choice of cells: see [`super::brick`].
 //!
 //! Source: mask and rank are those of succinct bit vectors (Jacobson 1989) as VDB leaf nodes use them (Museth 2013,
 //! section 3); the width per group is frame-of-reference coding (Goldstein et al. 1998).
@@ -94,8 +96,7 @@ fn push_brick(brick: &Brick, stream: &mut Vec<u32>) {
         stream.push((brick.masks[cell] >> 32) as u32);
     }
     let (mut pending, mut bits) = (0u64, 0);
-    for cell in 0..8 {
-        let (base, width) = bases[cell];
+    for (cell, &(base, width)) in bases.iter().enumerate() {
         let mut left = if width == 0 { 0 } else { brick.masks[cell] };
         while left != 0 {
             let bit = left.trailing_zeros() as usize;

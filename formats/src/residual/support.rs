@@ -3,8 +3,9 @@
 //! First, for every block of 8 x 8 x 8 voxels (x fastest), whether it is empty, full or mixed: decision "empty", then
 //! decision "full", each with a counter chosen by the states of the blocks before it along the three axes. Then the
 //! voxels of the mixed blocks, in plain voxel order of the whole box, each from the bits that came before it: three
-//! neighbourhoods index a counter each, and a mixer weighs the three. About 40 ns a voxel of a mixed block, 20 ns a
-//! block; probabilities stay within 1/4096 of certainty.
+//! neighbourhoods index a counter each (`contexts`: first bit highest), and a mixer (rate 0.01, weights 0.4 at first,
+//! chosen by the low 7 bits of the first context) weighs the three. Counters average 250 decisions. Measured: 4 % of the
+//! codec's time, 0.10 to 0.13 bit for each voxel of the support of a rough plume. Probabilities stay within 1/4096 of certainty.
 //!
 //! Source: context templates as in JBIG2 (ITU-T T.88, section 6.2.5.3), here in three dimensions and mixed.
 
@@ -173,4 +174,48 @@ fn contexts(planes: &[Vec<u8>; 3], at: usize, width: usize) -> [usize; 3] {
         (0, -w + 2),
     ]);
     [near, counted, wide]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::range_coder::{Decoder, Encoder};
+    use super::*;
+
+    /// Bytes that the support takes, after checking that it returns.
+    fn returns(dims: [u32; 3], rule: impl Fn(i64, i64, i64) -> bool) -> usize {
+        let [nx, ny, _] = dims.map(i64::from);
+        let mut support = VoxelMask::new(dims.iter().product::<u32>() as usize);
+        (0..support.len() as i64)
+            .filter(|v| rule(v % nx, v / nx % ny, v / (nx * ny)))
+            .for_each(|v| support.set(v as usize));
+        let sweep = Sweep::new(dims);
+        let mut encoder = Encoder::new(Vec::new());
+        assert!(code(&mut encoder, &sweep, &mut support.clone()));
+        let bytes = encoder.finish();
+        let mut decoder = Decoder::new(&bytes);
+        let mut found = VoxelMask::new(support.len());
+        assert!(code(&mut decoder, &sweep, &mut found));
+        assert!(found == support && decoder.position() == bytes.len());
+        bytes.len()
+    }
+
+    #[test]
+    fn empty_and_full_boxes_take_next_to_nothing() {
+        assert!(returns([256; 3], |_, _, _| false) < 80);
+        assert!(returns([101, 67, 93], |_, _, _| true) < 40);
+    }
+
+    #[test]
+    fn a_ball_costs_a_fraction_of_a_bit_for_a_voxel_of_its_surface() {
+        let bytes = returns([70, 64, 66], |x, y, z| (x - 33).pow(2) + (y - 31).pow(2) + (z - 33).pow(2) < 900);
+        // 4 pi 30^2 = 11310 voxels of surface.
+        assert!(bytes * 8 < 11310, "{bytes} bytes");
+    }
+
+    #[test]
+    fn noise_costs_little_more_than_a_bit_a_voxel() {
+        let bytes =
+            returns([40; 3], |x, y, z| ((x * 7919 + y * 104_729 + z * 1_299_709) * 2_654_435_761) >> 17 & 1 == 1);
+        assert!(bytes * 8 < 64_000 * 11 / 10, "{bytes} bytes");
+    }
 }

@@ -4,7 +4,7 @@
 //! encoded), one u32 start per block, then the blocks. A block of enough elements is cut into one stream per byte of an
 //! element; each stream is an i32 length and LZ4 data, or the plain bytes where that was no longer. Unshuffling puts
 //! byte `j` of element `i` from `j * elements + i` back to `i * size + j`; bytes past the last whole element stay.
-//! Cost: one LZ4 pass and one transposition, about 1 ns a byte.
+//! Cost: one LZ4 pass and one transposition, below 2 ns a byte.
 //!
 //! Source: Blosc 1.21, `README_CHUNK_FORMAT.rst` and the split rule of `blosc_d`. OpenVDB only ever writes LZ4 with
 //! byte shuffle and one block a chunk; other codecs are refused by name.
@@ -74,7 +74,7 @@ pub(super) fn decode(chunk: &mut Bytes, out: &mut [u8], scratch: &mut Vec<u8>) -
 }
 
 fn decode_streams(bytes: &mut Bytes, out: &mut [u8], streams: usize) -> Result<()> {
-    if out.len() % streams != 0 {
+    if !out.len().is_multiple_of(streams) {
         return Err(bytes.invalid("Blosc block length", out.len(), format!("a multiple of {streams}")));
     }
     for to in out.chunks_mut(out.len() / streams) {
@@ -137,7 +137,8 @@ mod tests {
                 let split = bytes.len() == block && block / element >= 128 && element <= 16;
                 let stream = bytes.len() / if split { element } else { 1 };
                 // A stream that LZ4 does not make shorter is stored plain: its length is how a reader can tell.
-                let packed = |s: &[u8]| Some(lz4_flex::block::compress(s)).filter(|p| !plain_streams && p.len() < s.len());
+                let packed =
+                    |s: &[u8]| Some(lz4_flex::block::compress(s)).filter(|p| !plain_streams && p.len() < s.len());
                 let encode = |s: &[u8]| packed(s).unwrap_or_else(|| s.to_vec());
                 let cut = bytes.chunks(stream).map(encode);
                 cut.flat_map(|s| [(s.len() as u32).to_le_bytes().to_vec(), s].concat()).collect()

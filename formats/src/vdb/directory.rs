@@ -56,6 +56,16 @@ impl Descriptor {
         self.tree.strip_prefix("Tree_").and_then(|t| t.strip_suffix("_5_4_3")).unwrap_or(&self.tree)
     }
 
+    /// A cursor at the grid's content that ends where the grid ends, so that no grid reads the bytes of another.
+    fn cursor<'a>(&self, bytes: &Bytes<'a>) -> Result<Bytes<'a>> {
+        let mut whole = bytes.clone();
+        whole.seek(0, "start of the file")?;
+        let end = self.end_pos.and_then(|end| usize::try_from(end).ok()).unwrap_or(whole.remaining());
+        let mut cursor = Bytes::new(bytes.path(), whole.take(end, "end offset")?);
+        cursor.seek(self.content, "grid offset")?;
+        Ok(cursor)
+    }
+
     fn value_size(&self) -> Option<ValueSize> {
         ValueSize::of(self.value_type(), self.half).filter(|_| self.value_type() != self.tree)
     }
@@ -112,6 +122,8 @@ impl Directory {
                 let error = in_grid(error, &grid.shown());
                 grids.push(grid);
                 return Ok(Self { grids, stopped: Some(error) });
+            } else {
+                grid.end_pos = Some(bytes.position() as u64);
             }
             grids.push(grid);
         }
@@ -123,10 +135,15 @@ impl Directory {
         let shown = self.grids.iter().find(|g| g.shown() == name);
         match (shown.or_else(|| self.grids.iter().find(|g| g.name() == name)), &self.stopped) {
             (Some(grid), _) => Ok(grid),
-            (None, Some(stopped)) => Err(bytes.invalid("grid", format!("no '{name}' before: {stopped}"), name)),
+            (None, Some(stopped)) => {
+                Err(bytes.invalid("grid", format!("no '{name}' before: {stopped}"), format!("a grid named '{name}'")))
+            }
             (None, None) => {
-                let there: Vec<String> =
-                    self.grids.iter().map(|g| format!("{} ({})", g.shown().escape_debug(), g.value_type())).collect();
+                let there: Vec<String> = self
+                    .grids
+                    .iter()
+                    .map(|g| format!("{} ({})", g.shown().escape_debug(), g.value_type().escape_debug()))
+                    .collect();
                 let found = if there.is_empty() { "no grids".to_owned() } else { there.join(", ") };
                 Err(bytes.invalid("grid", found, format!("a grid named '{name}'")))
             }
@@ -135,16 +152,16 @@ impl Directory {
 
     /// Reads the transform and the voxels of a grid of `self`.
     pub fn read_grid(&self, bytes: &Bytes, grid: &Descriptor) -> Result<(DAffine3, dense::Dense)> {
-        self.grid(bytes.clone(), grid).map_err(|error| in_grid(error, &grid.shown()))
+        self.grid(bytes, grid).map_err(|error| in_grid(error, &grid.shown()))
     }
 
-    fn grid(&self, mut bytes: Bytes, grid: &Descriptor) -> Result<(DAffine3, dense::Dense)> {
+    fn grid(&self, file: &Bytes, grid: &Descriptor) -> Result<(DAffine3, dense::Dense)> {
         let float = ValueSize::of("float", grid.half);
         let Some(size) = grid.value_size().filter(|s| Some(*s) == float && grid.value_type() == "float") else {
             let hint = "density must be a float grid of the usual 5-4-3 tree (Tree_float_5_4_3)";
-            return Err(Error::unsupported(bytes.path(), "grid type", grid.tree.escape_debug(), hint));
+            return Err(Error::unsupported(file.path(), "grid type", grid.tree.escape_debug(), hint));
         };
-        bytes.seek(grid.content, "grid offset")?;
+        let mut bytes = grid.cursor(file)?;
         let content = Content::read(&mut bytes)?;
         let world_from_index = transform::read(&mut bytes, &content.map)?;
         if grid.instance_parent.is_empty() {
@@ -157,7 +174,7 @@ impl Directory {
             let expected = "a grid of this file that is no instance itself";
             return Err(bytes.invalid("instance parent", grid.instance_parent.escape_debug(), expected));
         };
-        let (_, voxels) = self.read_grid(&bytes, parent)?;
+        let (_, voxels) = self.read_grid(file, parent)?;
         Ok((world_from_index, voxels))
     }
 
@@ -167,9 +184,7 @@ impl Directory {
             return Err(stopped);
         }
         let info = |grid: &Descriptor| {
-            let mut bytes = bytes.clone();
-            bytes.seek(grid.content, "grid offset")?;
-            let content = Content::read(&mut bytes)?;
+            let content = Content::read(&mut grid.cursor(bytes)?)?;
             Ok(GridInfo {
                 name: grid.shown(),
                 value_type: grid.value_type().to_owned(),
@@ -200,7 +215,9 @@ fn skip_content(bytes: &mut Bytes, grid: &Descriptor) -> Result<()> {
 
 /// The same error, naming the grid.
 fn in_grid(error: Error, grid: &str) -> Error {
-    let named = |what: String| if what.starts_with("grid '") { what } else { format!("grid '{}': {what}", grid.escape_debug()) };
+    let named = |what: String| {
+        if what.starts_with("grid '") { what } else { format!("grid '{}': {what}", grid.escape_debug()) }
+    };
     match error {
         Error::Invalid { path, what, found, expected } => Error::Invalid { path, what: named(what), found, expected },
         Error::Unsupported { path, what, found, hint } => Error::Unsupported { path, what: named(what), found, hint },

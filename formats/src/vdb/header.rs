@@ -44,17 +44,21 @@ pub(super) fn read(bytes: &mut Bytes) -> Result<Header> {
 
 /// A name: u32 length, then as many bytes. Bytes that are not UTF-8 become replacement characters.
 pub(super) fn name(bytes: &mut Bytes, what: &str) -> Result<String> {
+    Ok(String::from_utf8_lossy(raw_name(bytes, what)?).into_owned())
+}
+
+fn raw_name<'a>(bytes: &mut Bytes<'a>, what: &str) -> Result<&'a [u8]> {
     let length = bytes.count(1, what)?;
     if length > LONGEST_NAME {
         return Err(bytes.invalid(what, format!("{length} bytes"), format!("at most {LONGEST_NAME}")));
     }
-    Ok(String::from_utf8_lossy(bytes.take(length, what)?).into_owned())
+    bytes.take(length, what)
 }
 
-/// One metadata map: entries in file order, values as they lie in the file.
+/// One metadata map: name, type and value of each entry as they lie in the file, in its order.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Metadata<'a> {
-    entries: Vec<(String, String, &'a [u8])>,
+    entries: Vec<[&'a [u8]; 3]>,
 }
 
 impl<'a> Metadata<'a> {
@@ -63,15 +67,15 @@ impl<'a> Metadata<'a> {
         let count = bytes.count(12, "metadata count")?;
         let mut entries = Vec::with_capacity(count);
         for _ in 0..count {
-            let (name, kind) = (name(bytes, "metadata name")?, name(bytes, "metadata type")?);
+            let (name, kind) = (raw_name(bytes, "metadata name")?, raw_name(bytes, "metadata type")?);
             let length = bytes.count(1, "metadata length")?;
-            entries.push((name, kind, bytes.take(length, "metadata value")?));
+            entries.push([name, kind, bytes.take(length, "metadata value")?]);
         }
         Ok(Self { entries })
     }
 
     fn value(&self, name: &str, kind: &str) -> Option<&'a [u8]> {
-        self.entries.iter().find(|(n, k, _)| n == name && k == kind).map(|&(_, _, value)| value)
+        self.entries.iter().find(|[n, k, _]| *n == name.as_bytes() && *k == kind.as_bytes()).map(|[_, _, value]| *value)
     }
 
     /// The string entry `name`.

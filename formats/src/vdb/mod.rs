@@ -19,11 +19,11 @@ mod blosc;
 mod dense;
 mod directory;
 mod header;
+#[cfg(test)]
+mod tests;
 mod topology;
 mod transform;
 mod values;
-#[cfg(test)]
-mod tests;
 mod write;
 
 use crate::bounded::Bytes;
@@ -33,10 +33,10 @@ use directory::Directory;
 use std::path::Path;
 
 pub(crate) use header::MAGIC;
-pub use write::{WriteOptions, write};
+pub use write::{WriteOptions, half_rounding, write};
 
 /// What a file says about one of its grids.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, serde::Serialize)]
 pub struct GridInfo {
     /// The name; `name[1]` if the file has several of that name. Either form can be given to [`read`].
     pub name: String,
@@ -57,8 +57,9 @@ pub struct GridInfo {
 /// Reads the float grid called `grid` (usually "density") of the file at `path`.
 ///
 /// The box holds the active voxels and, if the background is zero, every inactive voxel of another value too. A voxel
-/// of the box has the value that OpenVDB would give, background included. Values are not judged: see
-/// [`DensityGrid::check_density`]. An empty grid is a box of no voxels.
+/// of the box has the value that OpenVDB would give, background included; outside the box a [`DensityGrid`] is zero even
+/// if the background is not. Values are not judged: see [`DensityGrid::check_density`]. An empty grid is a box of no
+/// voxels. The box has at most [`crate::bounded::MAX_DENSE_VOXELS`] voxels.
 pub fn read(path: &Path, grid: &str) -> Result<DensityGrid> {
     read_bytes(path, &load(path)?, grid)
 }

@@ -130,9 +130,15 @@ mod tests {
         let far = DVec3::new(1e6, -2.5, 1e-6);
         for (kind, map) in [
             ("UniformScaleMap", DAffine3::from_scale(DVec3::splat(1e-6))),
-            ("UniformScaleTranslateMap", DAffine3 { matrix3: DMat3::from_diagonal(DVec3::splat(1e6)), translation: far }),
+            (
+                "UniformScaleTranslateMap",
+                DAffine3 { matrix3: DMat3::from_diagonal(DVec3::splat(1e6)), translation: far },
+            ),
             ("ScaleMap", DAffine3::from_scale(DVec3::new(0.1, -0.2, 0.3))),
-            ("ScaleTranslateMap", DAffine3 { matrix3: DMat3::from_diagonal(DVec3::new(3.0, 2.0, 1.0)), translation: far }),
+            (
+                "ScaleTranslateMap",
+                DAffine3 { matrix3: DMat3::from_diagonal(DVec3::new(3.0, 2.0, 1.0)), translation: far },
+            ),
             ("AffineMap", DAffine3 { matrix3: rotation, translation: far }),
         ] {
             assert_eq!(round_trip(map), (kind.to_owned(), map));

@@ -303,8 +303,7 @@ fn gather<const B: usize>(kernel: &Kernel, first: usize, field: &[Block], lattic
             }
         }
     }
-    for b in 0..B {
-        let (bx, ux) = (&kernel.bx[first + b], &kernel.ux[first + b]);
+    for (b, (bx, ux)) in kernel.bx[first..].iter().zip(&kernel.ux[first..]).take(B).enumerate() {
         for l in 0..LANES {
             let (bx, ux) = (f64::from(bx[l]), f64::from(ux[l]));
             let [m0, my, mz, m2] = [0, 1, 2, 3].map(|k| bx * f64::from(columns[k][b][l]));

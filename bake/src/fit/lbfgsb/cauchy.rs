@@ -81,7 +81,8 @@ pub(super) fn cauchy_point(x: &[f64], gradient: &[f64], lower: &[f64], upper: &[
         to_minimum = -slope / curvature;
         now = time;
         // Past the last breakpoint of a path that is bounded everywhere nothing moves any more.
-        if !(slope < 0.0) {
+        let falling = slope < 0.0;
+        if !falling {
             to_minimum = 0.0;
             break;
         }
@@ -119,9 +120,8 @@ mod tests {
         let gradient = [1.0, -2.0, 3.0, -0.5, -4.0, 0.0];
         let (lower, upper) = ([-0.1, -1.0, -1.0, f64::NEG_INFINITY, -1.0, -1.0], [1.0; 6]);
         let found = cauchy_point(&x, &gradient, &lower, &upper, &memory);
-        let path = |t: f64| -> Vec<f64> {
-            (0..6).map(|i| (x[i] - t * gradient[i]).clamp(lower[i], upper[i])).collect()
-        };
+        let path =
+            |t: f64| -> Vec<f64> { (0..6).map(|i| (x[i] - t * gradient[i]).clamp(lower[i], upper[i])).collect() };
         let mut t = 0.0;
         while model(&x, &path(t + 1e-5), &gradient, &memory) < model(&x, &path(t), &gradient, &memory) {
             t += 1e-5;

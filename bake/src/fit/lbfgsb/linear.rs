@@ -34,7 +34,8 @@ pub(super) fn invert(mut a: Vec<f64>, n: usize) -> Option<Vec<f64>> {
         let pivot = (column..n).max_by(|&i, &j| a[i * n + column].abs().total_cmp(&a[j * n + column].abs()))?;
         let value = a[pivot * n + column];
         // The diagonal is 1: a pivot below 1e-14 is rounding noise.
-        if !(value.abs() > 1e-14) {
+        let sound = value.abs() > 1e-14;
+        if !sound {
             return None;
         }
         for j in 0..n {
@@ -67,7 +68,8 @@ pub(super) fn solve(mut a: Vec<f64>, mut b: Vec<f64>) -> Option<Vec<f64>> {
     for column in 0..n {
         let pivot = (column..n).max_by(|&i, &j| a[i * n + column].abs().total_cmp(&a[j * n + column].abs()))?;
         let value = a[pivot * n + column];
-        if !(value.abs() > f64::MIN_POSITIVE) {
+        let sound = value.abs() > f64::MIN_POSITIVE;
+        if !sound {
             return None;
         }
         (0..n).for_each(|j| a.swap(pivot * n + j, column * n + j));

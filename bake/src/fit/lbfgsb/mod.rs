@@ -67,7 +67,8 @@ impl Lbfgsb {
         if lower.len() != upper.len() {
             return Err(LbfgsbError::Bounds(format!("{} lower and {} upper", lower.len(), upper.len())));
         }
-        if let Some(i) = (0..lower.len()).find(|&i| !(lower[i] <= upper[i])) {
+        let ordered = |i: usize| lower[i] <= upper[i];
+        if let Some(i) = (0..lower.len()).find(|&i| !ordered(i)) {
             return Err(LbfgsbError::Bounds(format!("variable {i}: lower {} and upper {}", lower[i], upper[i])));
         }
         Ok(Self {
@@ -186,15 +187,21 @@ impl Lbfgsb {
     ) -> Result<Step, Error> {
         let d: Vec<f64> = target.iter().zip(x).map(|(t, x)| t - x).collect();
         let slope = dot(&d, g);
-        if !(slope < 0.0) {
+        let falling = slope < 0.0;
+        if !falling {
             return Ok(None);
         }
-        // Without memory the target is only a direction; its length means nothing (L-BFGS-B: a step of length 1).
-        let first = match self.memory.pairs() {
-            0 => self.first_step.unwrap_or_else(|| dot(&d, &d).sqrt().recip()).min(1.0),
+        // Without memory the target is only a direction; its length means nothing unless the box gives it one
+        // (L-BFGS-B: a first step of length 1, or to the Cauchy point where all variables are boxed).
+        let fresh = self.memory.pairs() == 0;
+        let finite = |bounds: &[f64]| bounds.iter().filter(|b| b.is_finite()).count();
+        let (low, high) = (finite(&self.lower), finite(&self.upper));
+        let first = match self.first_step {
+            Some(step) if fresh => step.min(1.0),
+            None if fresh && low.min(high) < x.len() => dot(&d, &d).sqrt().recip().min(1.0),
             _ => 1.0,
         };
-        let longest = if self.memory.pairs() == 0 { 1.0 } else { self.longest(x, &d).max(1.0) };
+        let longest = if fresh && low + high > 0 { 1.0 } else { self.longest(x, &d).max(1.0) };
         let mut search = Search::new(cost, slope, first, longest);
         let mut best: Step = None;
         let mut retreats = 0;

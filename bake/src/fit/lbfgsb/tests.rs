@@ -20,7 +20,8 @@ fn minimise(
     upper: Vec<f64>,
 ) -> Result<(Vec<f64>, f64, usize), Error> {
     let solver = Lbfgsb::new(lower, upper, 10)?.gradient_tolerance(1e-9).cost_tolerance(0.0);
-    let result = Executor::new(Function(f), solver).configure(|s: State| s.param(x).max_iters(5000)).timer(false).run()?;
+    let result =
+        Executor::new(Function(f), solver).configure(|s: State| s.param(x).max_iters(5000)).timer(false).run()?;
     let best = result.state.param.clone().unwrap_or_default();
     Ok((best, result.state.cost, result.solver.evaluations()))
 }
@@ -109,7 +110,9 @@ fn the_sample_problem_of_the_original_code_is_solved() {
 
 #[test]
 fn a_thousand_variables_of_the_paired_rosenbrock_function_are_solved() {
-    let f = |x: &[f64], g: &mut [f64]| (0..x.len() / 2).map(|p| rosenbrock(&x[2 * p..2 * p + 2], &mut g[2 * p..2 * p + 2])).sum();
+    let f = |x: &[f64], g: &mut [f64]| {
+        (0..x.len() / 2).map(|p| rosenbrock(&x[2 * p..2 * p + 2], &mut g[2 * p..2 * p + 2])).sum()
+    };
     let start = (0..1000).map(|i| if i % 2 == 0 { -1.2 } else { 1.0 }).collect();
     let (x, f, evaluations) = minimise(f, start, vec![-INF; 1000], vec![INF; 1000]).unwrap();
     assert_near(&x, &vec![1.0; 1000]);
@@ -161,7 +164,8 @@ fn random_bounded_quadratics_agree_with_projected_gradient_descent() {
 fn the_cost_never_rises_from_one_iteration_to_the_next() {
     let solver = Lbfgsb::new(vec![-1.5; 10], vec![1.5; 10], 5).unwrap();
     let problem = Function(rosenbrock);
-    let mut result = Executor::new(problem, solver).configure(|s: State| s.param(vec![-1.2; 10]).max_iters(1)).run().unwrap();
+    let mut result =
+        Executor::new(problem, solver).configure(|s: State| s.param(vec![-1.2; 10]).max_iters(1)).run().unwrap();
     for _ in 0..200 {
         let before = result.state.cost;
         let (x, g) = (result.state.take_param().unwrap(), result.state.take_gradient().unwrap());

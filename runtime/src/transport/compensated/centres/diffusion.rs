@@ -16,8 +16,13 @@
 //! Source: Zhou et al. 2008, section 5.4; the printed equations 5, 6 and 13 count albedo twice in S and miss a factor 3 in
 //! S and in L1: up to 39 % too bright in a slab, against 10 to 12 % with the forms above.
 //! The system itself is ill-posed: it knows no outflow, and for albedo 1 the constant is a null vector. We therefore
-//! scale rows to length 1, damp by [`DAMPING`] (Tikhonov), solve by CGLS, and clamp `0 <= L0 <= max L_in` and
+//! scale rows to length 1, damp by 0.1 (Tikhonov), solve by CGLS, and clamp `0 <= L0 <= max L_in` and
 //! `|L1| <= L0` (radiance is positive). Use [`super::integral`] unless the paper's look is asked for.
+//!
+//! The damping was tuned on 48 settings (300 and 600 Gaussians put on one plume, uniform and one-sided light, sigma_t 3
+//! to 30, albedo 0.66 to 0.99, g 0 and 0.42), mean and largest relative difference of J to integral transport's: 0.001:
+//! .47, 2.4; 0.01: .46, 2.2; 0.03: .39, 1.5; 0.06: .33, .71; 0.1: .31, .55; 0.15: .33, .63; no multiple scattering: .43,
+//! .78. From 0.06 on diffusion is never worse than leaving it out.
 //!
 //! Cost: n^2 exponentials, then 4 n^2 per iteration and channel. Memory: 16 n^2 bytes.
 
@@ -27,7 +32,7 @@ use crate::medium::gaussian_points::GaussianPoints;
 use crate::transport::medium::BandedMedium;
 
 /// Tikhonov parameter on rows of length 1: minimises |A x - b|^2 + DAMPING^2 |x - x0|^2, x0 = 0.
-const DAMPING: f64 = 1e-2;
+const DAMPING: f64 = 0.1;
 /// CGLS iterations at most; the paper uses 20 to 40, without damping.
 const ITERATIONS: usize = 60;
 /// CGLS ends when the gradient has fallen by this factor.
@@ -374,13 +379,13 @@ mod tests {
 
     #[test]
     fn one_gaussian_gives_the_known_and_clamped_answer() {
-        // L0 = J0 / (1 - albedo) up to damping 1e-4, clamped to the light.
+        // L0 = J0 / (1 - albedo), damped by 1 + 0.1^2, clamped to the light.
         let system = Diffusion::new(&points(&cloud(1, 1)));
-        for (albedo, expected) in [(0.5, 0.2), (0.99, 1.0)] {
+        for (albedo, expected) in [(0.5, 0.2 / 1.01), (0.99, 1.0)] {
             let mut j = vec![[0.0; 3]; 16];
             j[0][1] = 0.1 * ROOT;
             let level = system.add(&mut j, 4, &medium(albedo, 0.3), channel(1, 5.0, 1.0), None);
-            assert!((level[0] - expected).abs() < 1e-4, "{level:?}");
+            assert!((level[0] - expected).abs() < 1e-6, "{level:?}");
             assert!((j[0][1] - (0.1 + albedo * level[0]) * ROOT).abs() < 1e-5);
             assert_eq!((j[0][0], j[1][1]), (0.0, 0.0));
         }
@@ -419,9 +424,9 @@ mod tests {
         let medium = medium(0.9, 0.0);
         let cold = system.add(&mut source.clone(), 1, &medium, channel(0, 10.0, 10.0), None);
         let warm = system.add(&mut source.clone(), 1, &medium, channel(0, 10.0, 10.0), Some(&cold));
-        // Stopped at a gradient of 1e-6, or after 60 iterations, on a system whose damping keeps its condition <= 1e4.
+        // Stopped at a gradient of 1e-6 of |A^T b| <= |A|^2 |x|; undone by (A^T A + damping^2)^-1 <= 100, |A|^2 of a few.
         for (a, b) in cold.iter().zip(&warm) {
-            assert!((a - b).abs() < 2e-2, "{a} {b}");
+            assert!((a - b).abs() < 3e-3, "{a} {b}");
         }
     }
 }

@@ -346,7 +346,7 @@ mod tests {
         let case = case(&few());
         let (scale, photons) = (8.0, 20_000);
         let matrix = case.matrix(scale, 1);
-        let mut pcg = Pcg::new(5);
+        let (mut pcg, mut shown) = (Pcg::new(5), 0);
         for i in 0..5 {
             let mut moments = [[0.0f64; 2]; 5];
             for _ in 0..photons {
@@ -366,8 +366,14 @@ mod tests {
                 // 98 directions and 64 steps are good to 7e-3 of a row; sigma is about 2e-3: both count.
                 let z = (found - mean) / (sigma * sigma + (2e-3f64).powi(2)).sqrt();
                 assert!(z.abs() < 4.0, "{i} {h}: {found} against {mean} +- {sigma}");
+                if found > 0.15 {
+                    let planted = (1.1 * found - mean) / (sigma * sigma + (2e-3f64).powi(2)).sqrt();
+                    assert!(planted.abs() > 4.0, "a tenth too much must show: {i} {h}, z = {planted}");
+                    shown += 1;
+                }
             }
         }
+        assert!(shown >= 5, "{shown}");
     }
 
     #[test]

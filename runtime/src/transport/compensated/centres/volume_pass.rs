@@ -225,11 +225,11 @@ mod tests {
                             sum += term * f64::from(j);
                         }
                     }
-                    // Nearer to the cut than rounding may put a term of 1.2e-4 to either side: only well inside.
+                    // Rounding may put a term of 1.2e-4 to either side of the cut: 1.2e-4 / 0.1 of J's spread (< 2).
                     if density > 0.1 {
                         covered += 1;
                         assert!(
-                            (f64::from(found[1]) - (sum / density).max(0.0)).abs() < 2e-3,
+                            (f64::from(found[1]) - (sum / density).max(0.0)).abs() < 2.5e-3,
                             "{v}: {found:?} {}",
                             sum / density
                         );

@@ -1,4 +1,4 @@
-//! Voxel for voxel against OpenVDB's own library: what it wrote we read, what we write it reads.
+//! Voxel for voxel against other readers: what OpenVDB's own library wrote we read, what we write it reads.
 //!
 //! The expectation comes from `openvdb_expectation.py`, which uses pyopenvdb alone (Debian: python3-openvdb,
 //! python3-numpy). A missing library is a failure, not a skip.
@@ -240,4 +240,16 @@ fn every_real_file_reads_as_openvdb_reads_it() {
     compare(&grids);
     let message = vdb::read(&grids[1].0, "velocity").unwrap_err().to_string();
     assert!(message.contains("grid 'velocity'") && message.contains("Tree_vec3s_5_4_3"), "{message}");
+}
+
+#[test]
+#[ignore = "needs ../shared/data"]
+fn the_pbrt_smoke_reads_as_another_reader_reads_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let (path, out) = (shared_data().join("grids/pbrt_smoke_100x100x40.pbrt"), folder.path().join("expected"));
+    script("pbrt_expectation.py", &[path.to_str().unwrap(), out.to_str().unwrap()]);
+    let expected = parse(&std::fs::read(out).unwrap());
+    let grid = smoke_formats::volume::read(&path, "density").unwrap();
+    assert_eq!(grid.dims, [100, 100, 40]);
+    assert_eq!(difference(&grid, &expected), None);
 }
