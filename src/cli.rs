@@ -33,6 +33,8 @@ pub enum Command {
     Validate(ValidateArgs),
     /// Decode a pack's frames to OpenVDB or Mitsuba volumes.
     Unpack(UnpackArgs),
+    /// Render a pack's frames to OpenEXR: camera, lights and medium come from a scene file.
+    Render(Box<RenderArgs>),
 }
 
 /// Options of `compare`.
@@ -80,6 +82,41 @@ pub enum ScatteringOrder {
     /// Light of all orders.
     #[default]
     All,
+}
+
+/// Where the source radiance is solved.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum RouteChoice {
+    /// On grid nodes.
+    #[default]
+    Grid,
+    /// At the Gaussians' centres, as Zhou et al. 2008 do.
+    Centres,
+}
+
+/// From optical depth to transmittance, at centres.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum ExponentialChoice {
+    /// True depths along directions; right at any depth.
+    #[default]
+    Direct,
+    /// Harmonics of the depth, exponentiated along directions; good to depth 3.
+    Pointwise,
+    /// Optimal linear with scaling and squaring; good to depth 1.
+    Hybrid,
+    /// Optimal linear, the paper's; good to depth 0.5.
+    Linear,
+}
+
+/// How light that scatters more than once is found.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum MultipleChoice {
+    /// Integral transport on grid nodes.
+    Transport,
+    /// Integral transport between centres.
+    Integral,
+    /// Diffusion between centres, the paper's, corrected.
+    Diffusion,
 }
 
 /// How the addresses of the residual's voxels are stored.
@@ -194,24 +231,51 @@ pub struct RenderArgs {
     /// The scene file.
     #[arg(long, value_name = "SCENE")]
     pub scene: PathBuf,
-    /// The images to write, such as out.####.exr.
-    #[arg(short, long, value_name = "PATTERN")]
+    /// The images to write, such as out.####.exr; also %04d, $F4 or @@@@, or a plain name for one frame.
+    #[arg(short, long, value_name = "PATTERN", value_parser = exr_pattern)]
     pub output: PathBuf,
     /// Frames to render [default: all in the pack].
     #[arg(long, value_name = "RANGE")]
-    pub frames: Option<String>,
-    /// Order of the spherical harmonics of light and source radiance.
-    #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u8).range(1..=6))]
-    pub sh_order: u8,
+    pub frames: Option<FrameSelection>,
+    /// Where the source radiance is solved.
+    #[arg(long, value_enum, default_value_t)]
+    pub route: RouteChoice,
     /// Scattering orders.
     #[arg(long, value_enum, default_value_t)]
     pub order: ScatteringOrder,
+    /// Order of the spherical harmonics of phase function and source radiance.
+    #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u8).range(1..=6))]
+    pub sh_order: u8,
+    /// Beams that an environment is cut into (route grid) [default: 96].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=65536))]
+    pub beams: Option<u32>,
+    /// Voxels between nodes of single scattering (route grid) [default: 1, more in huge frames].
+    #[arg(long, value_name = "VOXELS", value_parser = clap::value_parser!(u32).range(1..=64))]
+    pub source_step: Option<u32>,
+    /// Voxels between nodes of multiple scattering (route grid) [default: 2; 1 in thick smoke, more in huge frames].
+    #[arg(long, value_name = "VOXELS", value_parser = clap::value_parser!(u32).range(1..=64))]
+    pub scatter_step: Option<u32>,
+    /// From optical depth to transmittance (route centres) [default: direct].
+    #[arg(long, value_enum)]
+    pub exponential: Option<ExponentialChoice>,
+    /// Light scattered more than once [default: transport with route grid, integral with route centres].
+    #[arg(long, value_enum)]
+    pub multiple: Option<MultipleChoice>,
+    /// Voxels between samples along a ray.
+    #[arg(long, value_name = "VOXELS", default_value_t = 0.5, value_parser = march_step)]
+    pub march_step: f64,
+    /// Transmittance below which a ray ends.
+    #[arg(long, value_name = "T", default_value_t = 0.001, value_parser = cutoff)]
+    pub cutoff: f64,
+    /// Rays along a side of a pixel: N x N rays a pixel.
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=64))]
+    pub samples: u8,
     /// Instead of the scene's sigma_t: a number, or R,G,B.
     #[arg(long, value_name = "RGB", value_parser = rgb)]
-    pub sigma_t: Option<[f64; 3]>,
+    pub sigma_t: Option<Rgb>,
     /// Instead of the scene's albedo: a number, or R,G,B.
     #[arg(long, value_name = "RGB", value_parser = rgb)]
-    pub albedo: Option<[f64; 3]>,
+    pub albedo: Option<Rgb>,
     /// Instead of the scene's g.
     #[arg(long, value_name = "COSINE", allow_negative_numbers = true)]
     pub g: Option<f64>,
@@ -230,10 +294,13 @@ pub struct RenderArgs {
     /// How progress is shown.
     #[arg(long, value_enum, default_value_t)]
     pub progress: ProgressMode,
-    /// Print one JSON document with seconds per stage.
+    /// Print one JSON document with settings and seconds per stage and frame.
     #[arg(long)]
     pub json: bool,
 }
+
+/// Three channels.
+pub type Rgb = [f64; 3];
 
 /// Options of `inspect`.
 #[derive(Args, Debug)]
@@ -306,6 +373,25 @@ fn difference_path(text: &str) -> Result<PathBuf, String> {
     }
 }
 
+fn exr_pattern(text: &str) -> Result<PathBuf, String> {
+    let path = PathBuf::from(text);
+    match path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase).as_deref() {
+        Some("exr") => Ok(path),
+        _ => Err("expected a name that ends in .exr".into()),
+    }
+}
+
+fn march_step(text: &str) -> Result<f64, String> {
+    positive(text).ok().filter(|&v| v <= 4.0).ok_or_else(|| "expected voxels above 0, up to 4".into())
+}
+
+fn cutoff(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(v) if (0.0..1.0).contains(&v) => Ok(v),
+        _ => Err("expected a transmittance from 0 to below 1".into()),
+    }
+}
+
 fn volume_pattern(text: &str) -> Result<PathBuf, String> {
     let path = PathBuf::from(text);
     match path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase).as_deref() {
@@ -324,7 +410,6 @@ mod tests {
         Cli::command().debug_assert();
         let all = clap::Command::new("all");
         all.subcommand(BakeArgs::augment_args(clap::Command::new("bake")))
-            .subcommand(RenderArgs::augment_args(clap::Command::new("render")))
             .subcommand(DemoArgs::augment_args(clap::Command::new("demo")))
             .debug_assert();
     }

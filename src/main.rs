@@ -9,6 +9,7 @@ mod failure;
 mod inspect;
 mod layers;
 mod progress;
+mod render;
 #[cfg_attr(not(test), expect(dead_code, reason = "`bake` writes through it"))]
 mod seconds;
 #[cfg(test)]
@@ -38,5 +39,6 @@ fn run() -> Result<(), Failure> {
         Command::Inspect(args) => inspect::run(&args),
         Command::Validate(args) => validate::run(&args),
         Command::Unpack(args) => unpack::run(&args),
+        Command::Render(args) => render::run(&args),
     }
 }
