@@ -32,9 +32,8 @@ fn bake(args: &BakeArgs) -> Result<(), Failure> {
         return plan(args, &survey, &settings);
     }
     let json = settings_json(args, &settings, &survey);
-    let times = watch(args, &survey, |observe| {
-        pipeline::bake(&survey, &settings, &json, &args.output, args.resume, observe)
-    })?;
+    let times =
+        watch(args, &survey, |observe| pipeline::bake(&survey, &settings, &json, &args.output, args.resume, observe))?;
     seconds::write(&args.output, &times)?;
     let pack = Pack::open(&args.output)?;
     let times = seconds::read(&pack);
@@ -66,7 +65,10 @@ fn frames(args: &BakeArgs) -> Result<(String, Vec<SequenceFrame>), Failure> {
 fn report_clamped(survey: &Survey) {
     for frame in survey.frames.iter().filter(|f| f.clamped != Default::default()) {
         let (bad, negative) = (frame.clamped.non_finite, frame.clamped.negative);
-        eprintln!("smoke-bake: note: {}: {bad} voxels not finite and {negative} below zero set to 0", frame.path.display());
+        eprintln!(
+            "smoke-bake: note: {}: {bad} voxels not finite and {negative} below zero set to 0",
+            frame.path.display()
+        );
     }
 }
 
@@ -148,8 +150,14 @@ fn plan(args: &BakeArgs, survey: &Survey, settings: &BakeSettings) -> Result<(),
     let (first, last) = (&survey.frames[0], &survey.frames[survey.frames.len() - 1]);
     let text = format!(
         "would bake {} frames ({} to {}) to {}\nbox {:?} from {:?}, {active} active voxels, largest density {}\nsettings {}\n",
-        survey.frames.len(), first.number, last.number, args.output.display(), survey.dims, survey.origin,
-        survey.density_max, document["settings"],
+        survey.frames.len(),
+        first.number,
+        last.number,
+        args.output.display(),
+        survey.dims,
+        survey.origin,
+        survey.density_max,
+        document["settings"],
     );
     answer::text(&text)
 }

@@ -17,8 +17,19 @@ const FRAMES: std::ops::RangeInclusive<i32> = 1..=8;
 static BAKED: LazyLock<tempfile::TempDir> = LazyLock::new(|| {
     let folder = tempfile::tempdir().unwrap();
     let target = MAX_ERROR.to_string();
-    let line =
-        ["bake", common::PLUME, "-o", "plume.smoke", "--gaussians", "40", "--first-evaluations", "20", "--next-evaluations", "6", "--max-error"];
+    let line = [
+        "bake",
+        common::PLUME,
+        "-o",
+        "plume.smoke",
+        "--gaussians",
+        "40",
+        "--first-evaluations",
+        "20",
+        "--next-evaluations",
+        "6",
+        "--max-error",
+    ];
     answer(folder.path(), &[&line[..], &[&target, "--progress", "none"]].concat());
     answer(folder.path(), &["unpack", "plume.smoke", "-o", "float.####.vdb", "--progress", "none"]);
     folder
@@ -174,7 +185,10 @@ fn all_64_frames_of_the_plume_keep_the_promise_by_openvdbs_own_reader() {
     let folder = tempfile::tempdir().unwrap();
     let input = shared_data().join("plume/plume.####.vdb");
     let line = ["bake", input.to_str().unwrap(), "-o", "plume.smoke", "--max-error", "0.002"];
-    answer(folder.path(), &[&line[..], &["--gaussians", "100", "--first-evaluations", "60", "--next-evaluations", "12"]].concat());
+    answer(
+        folder.path(),
+        &[&line[..], &["--gaussians", "100", "--first-evaluations", "60", "--next-evaluations", "12"]].concat(),
+    );
     answer(folder.path(), &["unpack", "plume.smoke", "-o", "out.####.vdb"]);
     let pair = |frame: i32| -> (PathBuf, PathBuf) {
         (shared_data().join(format!("plume/plume.{frame}.vdb")), folder.path().join(format!("out.{frame}.vdb")))

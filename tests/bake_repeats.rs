@@ -10,7 +10,18 @@ use std::time::{Duration, Instant};
 
 /// A bake of the first frames, small enough to be repeated often.
 fn line<'a>(output: &'a str, more: &[&'a str]) -> Vec<&'a str> {
-    let few = ["--frames", "1-3", "--gaussians", "16", "--first-evaluations", "10", "--next-evaluations", "4", "--max-error", "0.01"];
+    let few = [
+        "--frames",
+        "1-3",
+        "--gaussians",
+        "16",
+        "--first-evaluations",
+        "10",
+        "--next-evaluations",
+        "4",
+        "--max-error",
+        "0.01",
+    ];
     [&["bake", common::PLUME, "-o", output, "--progress", "none"], &few[..], more].concat()
 }
 

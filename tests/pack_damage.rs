@@ -18,7 +18,18 @@ const PATIENCE: Duration = Duration::from_secs(20);
 static PACKS: LazyLock<[Vec<u8>; 2]> = LazyLock::new(|| {
     let folder = tempfile::tempdir().unwrap();
     ["1", "1-2"].map(|frames| {
-        let few = ["--gaussians", "40", "--first-evaluations", "10", "--next-evaluations", "4", "--max-error", "0.01", "--progress", "none"];
+        let few = [
+            "--gaussians",
+            "40",
+            "--first-evaluations",
+            "10",
+            "--next-evaluations",
+            "4",
+            "--max-error",
+            "0.01",
+            "--progress",
+            "none",
+        ];
         let line = ["bake", common::PLUME, "-o", "a.smoke", "--frames", frames];
         answer(folder.path(), &[&line[..], &few].concat());
         std::fs::read(folder.path().join("a.smoke")).unwrap()
