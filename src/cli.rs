@@ -1,7 +1,6 @@
 //! The command line: subcommands and their options, and nothing that acts on them.
 //!
-//! Each option's variable and settings key come from its long name (see `layers`). A subcommand is in [`Command`] when
-//! there is an engine behind it; the options of the others stand ready below.
+//! Each option's variable and settings key come from its long name (see `layers`).
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use smoke_formats::sequence::FrameSelection;
@@ -27,14 +26,18 @@ pub struct Cli {
 pub enum Command {
     /// Bake a sequence of volumes into one pack.
     Bake(BakeArgs),
-    /// Measure how far an image is from a reference: RMSE, PSNR, bias, largest error.
-    Compare(CompareArgs),
+    /// Render frames of a pack to OpenEXR.
+    Render(RenderArgs),
     /// Show what a pack holds: sequence, settings, and sizes, errors and seconds of every frame.
     Inspect(InspectArgs),
     /// Check every byte of a pack and name the first thing that is wrong.
     Validate(ValidateArgs),
     /// Decode a pack's frames to OpenVDB or Mitsuba volumes.
     Unpack(UnpackArgs),
+    /// Measure how far an image is from a reference: RMSE, PSNR, bias, largest error.
+    Compare(CompareArgs),
+    /// Bake and render a small plume that comes with the program, and relight it.
+    Demo(DemoArgs),
 }
 
 /// Options of `compare`.
@@ -82,6 +85,41 @@ pub enum ScatteringOrder {
     /// Light of all orders.
     #[default]
     All,
+}
+
+/// Where the source radiance is solved.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum RouteChoice {
+    /// On grid nodes.
+    #[default]
+    Grid,
+    /// At the Gaussians' centres, as Zhou et al. 2008 do.
+    Centres,
+}
+
+/// From optical depth to transmittance, at centres.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum ExponentialChoice {
+    /// True depths along directions; right at any depth.
+    #[default]
+    Direct,
+    /// Harmonics of the depth, exponentiated along directions; good to depth 3.
+    Pointwise,
+    /// Optimal linear with scaling and squaring; good to depth 1.
+    Hybrid,
+    /// Optimal linear, the paper's; good to depth 0.5.
+    Linear,
+}
+
+/// How light that scatters more than once is found.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum MultipleChoice {
+    /// Integral transport on grid nodes.
+    Transport,
+    /// Integral transport between centres.
+    Integral,
+    /// Diffusion between centres, the paper's, corrected.
+    Diffusion,
 }
 
 /// How the addresses of the residual's voxels are stored.
@@ -225,24 +263,51 @@ pub struct RenderArgs {
     /// The scene file.
     #[arg(long, value_name = "SCENE")]
     pub scene: PathBuf,
-    /// The images to write, such as out.####.exr.
-    #[arg(short, long, value_name = "PATTERN")]
+    /// The images to write, such as out.####.exr; also %04d, $F4 or @@@@, or a plain name for one frame.
+    #[arg(short, long, value_name = "PATTERN", value_parser = exr_pattern)]
     pub output: PathBuf,
     /// Frames to render [default: all in the pack].
     #[arg(long, value_name = "RANGE")]
-    pub frames: Option<String>,
-    /// Order of the spherical harmonics of light and source radiance.
-    #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u8).range(1..=6))]
-    pub sh_order: u8,
+    pub frames: Option<FrameSelection>,
+    /// Where the source radiance is solved.
+    #[arg(long, value_enum, default_value_t)]
+    pub route: RouteChoice,
     /// Scattering orders.
     #[arg(long, value_enum, default_value_t)]
     pub order: ScatteringOrder,
+    /// Order of the spherical harmonics of phase function and source radiance.
+    #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u8).range(1..=6))]
+    pub sh_order: u8,
+    /// Beams that an environment is cut into (route grid) [default: 96].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=65536))]
+    pub beams: Option<u32>,
+    /// Voxels between nodes of single scattering (route grid) [default: 1, more in huge frames].
+    #[arg(long, value_name = "VOXELS", value_parser = clap::value_parser!(u32).range(1..=64))]
+    pub source_step: Option<u32>,
+    /// Voxels between nodes of multiple scattering (route grid) [default: 2; 1 in thick smoke, more in huge frames].
+    #[arg(long, value_name = "VOXELS", value_parser = clap::value_parser!(u32).range(1..=64))]
+    pub scatter_step: Option<u32>,
+    /// From optical depth to transmittance (route centres) [default: direct].
+    #[arg(long, value_enum)]
+    pub exponential: Option<ExponentialChoice>,
+    /// Light scattered more than once [default: transport with route grid, integral with route centres].
+    #[arg(long, value_enum)]
+    pub multiple: Option<MultipleChoice>,
+    /// Voxels between samples along a ray.
+    #[arg(long, value_name = "VOXELS", default_value_t = 0.5, value_parser = march_step)]
+    pub march_step: f64,
+    /// Transmittance below which a ray ends.
+    #[arg(long, value_name = "T", default_value_t = 0.001, value_parser = cutoff)]
+    pub cutoff: f64,
+    /// Rays along a side of a pixel: N x N rays a pixel.
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=64))]
+    pub samples: u8,
     /// Instead of the scene's sigma_t: a number, or R,G,B.
     #[arg(long, value_name = "RGB", value_parser = rgb)]
-    pub sigma_t: Option<[f64; 3]>,
+    pub sigma_t: Option<Rgb>,
     /// Instead of the scene's albedo: a number, or R,G,B.
     #[arg(long, value_name = "RGB", value_parser = rgb)]
-    pub albedo: Option<[f64; 3]>,
+    pub albedo: Option<Rgb>,
     /// Instead of the scene's g.
     #[arg(long, value_name = "COSINE", allow_negative_numbers = true)]
     pub g: Option<f64>,
@@ -261,10 +326,13 @@ pub struct RenderArgs {
     /// How progress is shown.
     #[arg(long, value_enum, default_value_t)]
     pub progress: ProgressMode,
-    /// Print one JSON document with seconds per stage.
+    /// Print one JSON document with settings and seconds per stage and frame.
     #[arg(long)]
     pub json: bool,
 }
+
+/// Three channels.
+pub type Rgb = [f64; 3];
 
 /// Options of `inspect`.
 #[derive(Args, Debug)]
@@ -308,8 +376,14 @@ pub struct UnpackArgs {
 /// Options of `demo`.
 #[derive(Args, Debug)]
 pub struct DemoArgs {
-    /// The folder to fill: a pack, rendered frames and a contact sheet.
+    /// The folder to fill: the inputs, a pack, rendered frames and a contact sheet.
     pub output: PathBuf,
+    /// Threads; the result does not depend on it [default: one for each core].
+    #[arg(long, value_name = "N")]
+    pub threads: Option<usize>,
+    /// How progress is shown.
+    #[arg(long, value_enum, default_value_t)]
+    pub progress: ProgressMode,
 }
 
 fn positive(text: &str) -> Result<f64, String> {
@@ -337,6 +411,25 @@ fn difference_path(text: &str) -> Result<PathBuf, String> {
     }
 }
 
+fn exr_pattern(text: &str) -> Result<PathBuf, String> {
+    let path = PathBuf::from(text);
+    match path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase).as_deref() {
+        Some("exr") => Ok(path),
+        _ => Err("expected a name that ends in .exr".into()),
+    }
+}
+
+fn march_step(text: &str) -> Result<f64, String> {
+    positive(text).ok().filter(|&v| v <= 4.0).ok_or_else(|| "expected voxels above 0, up to 4".into())
+}
+
+fn cutoff(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(v) if (0.0..1.0).contains(&v) => Ok(v),
+        _ => Err("expected a transmittance from 0 to below 1".into()),
+    }
+}
+
 fn volume_pattern(text: &str) -> Result<PathBuf, String> {
     let path = PathBuf::from(text);
     match path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase).as_deref() {
@@ -353,11 +446,6 @@ mod tests {
     #[test]
     fn the_definitions_of_all_subcommands_are_sound() {
         Cli::command().debug_assert();
-        let all = clap::Command::new("all");
-        all.subcommand(BakeArgs::augment_args(clap::Command::new("bake")))
-            .subcommand(RenderArgs::augment_args(clap::Command::new("render")))
-            .subcommand(DemoArgs::augment_args(clap::Command::new("demo")))
-            .debug_assert();
     }
 
     fn parse<A: Args + FromArgMatches>(line: &[&str]) -> Result<A, clap::Error> {

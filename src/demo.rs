@@ -38,15 +38,15 @@ const INPUTS: [(&str, &[u8]); 13] = [
 /// Frames of the plume.
 const FRAMES: i32 = 8;
 
-/// Options of the bake: few Gaussians, so that it takes seconds; the promise holds whatever their number.
-const BAKE: [&str; 6] = ["--gaussians", "300", "--max-error", "0.002", "--fps", "8"];
+/// Options of the bake; Gaussians and promise are the defaults.
+const BAKE: [&str; 2] = ["--fps", "8"];
 
 /// The last frame in other lights and media: name, scene, further options of `render`.
 const RELIT: [(&str, &str, &[&str]); 4] = [
     ("turned", "turned.toml", &[]),
+    ("thin", "turned.toml", &["--sigma-t", "6", "--g", "0.7"]),
     ("sun", "sun.toml", &[]),
-    ("thick", "sunset.toml", &["--sigma-t", "60"]),
-    ("forward", "sunset.toml", &["--sigma-t", "5", "--g", "0.6"]),
+    ("thick", "sun.toml", &["--sigma-t", "120"]),
 ];
 
 /// Thumbnails in a row of the sheet, and the width of each in pixels.
@@ -87,8 +87,9 @@ pub fn run(args: &DemoArgs) -> Result<(), Failure> {
     let frames = pictures.iter().map(read).collect::<Result<Vec<_>, _>>()?;
     let sheet = out.join("contact_sheet.png");
     image::write_png(&sheet, &contact_sheet(&frames, COLUMNS, THUMBNAIL))?;
-    let text = "two rows: the plume over time; last row: its last frame relit (sky turned, sun, thick, forward)";
-    answer::text(&format!("{}: {text}\n", sheet.display()))
+    let names = RELIT.map(|(name, _, _)| name).join(", ");
+    let text = format!("rows 1 and 2: the plume over time; row 3: its last frame relit: {names}");
+    answer::text(&format!("{}\n{text}\n", sheet.display()))
 }
 
 fn folder(path: &Path) -> Result<(), Error> {
