@@ -89,7 +89,7 @@ impl<'a> Descent<'a> {
         let (lower, upper) = bounds.scaled(&units);
         let solver = Lbfgsb::new(lower, upper, memory)?
             .gradient_tolerance(1e-9)
-            .cost_tolerance(tolerance)
+            .cost_tolerance(tolerance, 0.0)
             .max_evaluations(evaluations)
             .first_step(0.5);
         let mut new = Self {
@@ -130,7 +130,7 @@ impl<'a> Descent<'a> {
             if gradient.is_empty() { s } else { s.gradient(gradient).cost(self.cost) }
         });
         let mut result = executor.run()?;
-        self.finished = iterations > 0 && result.state.iter < iterations;
+        self.finished = result.solver.finished();
         self.iterations += result.state.iter;
         self.cost = result.state.cost;
         let z = result.state.take_param().unwrap_or_default();
