@@ -2,7 +2,7 @@
 //!
 //! As in a bake, a frame starts from the Gaussians of the frame before as they lie in the pack (16 bits a number).
 
-use smoke_baking::fit::frame::{FitSettings, fit_first, fit_next};
+use smoke_baking::fit::frame::{FitSettings, fit_next, reference_error};
 use smoke_formats::gaussian::UnitSpace;
 use smoke_formats::pack::snap_gaussians;
 use smoke_formats::volume;
@@ -20,14 +20,12 @@ fn main() -> Result<(), Failure> {
         std::array::from_fn(|a| grids.iter().map(|g| g.origin[a] + g.dims[a] as i32).max().unwrap_or(0));
     let space = UnitSpace::of_box(low, std::array::from_fn(|a| (high[a] - low[a]) as u32));
     let settings = FitSettings { gaussians: n.parse()?, ..FitSettings::default() };
-    let (mut previous, mut first, mut sum, start) = (Vec::new(), None, 0.0, Instant::now());
+    let (mut previous, mut reference, mut sum, start) = (Vec::new(), f64::INFINITY, 0.0, Instant::now());
     for (grid, path) in grids.iter().zip(paths) {
         let began = Instant::now();
-        let fit = match first {
-            None => fit_first(grid, &space, &settings, &mut |_| ())?,
-            Some(first) => fit_next(grid, &space, &previous, first, &settings, &mut |_| ())?,
-        };
-        first.get_or_insert(fit.fit_error);
+        // Without Gaussians of a frame before this is a first frame.
+        let fit = fit_next(grid, &space, &previous, reference, &settings, &mut |_| ())?;
+        reference = reference_error(reference, fit.fit_error);
         sum += fit.fit_error;
         println!(
             "{path} {} Gaussians, error {:.5}, on the support {:.5}, {} evaluations, {} moved, {} new, {} deleted, {:.3} s",
