@@ -1,9 +1,9 @@
 //! The command line: subcommands and their options, and nothing that acts on them.
 //!
-//! Each option's variable and settings key come from its long name (see `layers`). A subcommand is in [`Command`] when
-//! there is an engine behind it; the options of the others stand ready below.
+//! Each option's variable and settings key come from its long name (see `layers`).
 
-use clap::{ArgAction, Args, Parser, Subcommand, ValueEnum};
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use smoke_formats::sequence::FrameSelection;
 use std::path::PathBuf;
 
 const LAYERS_HELP: &str = "\
@@ -24,8 +24,20 @@ pub struct Cli {
 /// What to do.
 #[derive(Debug, Subcommand)]
 pub enum Command {
+    /// Bake a sequence of volumes into one pack.
+    Bake(BakeArgs),
+    /// Render frames of a pack to OpenEXR.
+    Render(RenderArgs),
+    /// Show what a pack holds: sequence, settings, and sizes, errors and seconds of every frame.
+    Inspect(InspectArgs),
+    /// Check every byte of a pack and name the first thing that is wrong.
+    Validate(ValidateArgs),
+    /// Decode a pack's frames to OpenVDB or Mitsuba volumes.
+    Unpack(UnpackArgs),
     /// Measure how far an image is from a reference: RMSE, PSNR, bias, largest error.
     Compare(CompareArgs),
+    /// Bake and render a small plume that comes with the program, and relight it.
+    Demo(DemoArgs),
 }
 
 /// Options of `compare`.
@@ -75,6 +87,41 @@ pub enum ScatteringOrder {
     All,
 }
 
+/// Where the source radiance is solved.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum RouteChoice {
+    /// On grid nodes.
+    #[default]
+    Grid,
+    /// At the Gaussians' centres, as Zhou et al. 2008 do.
+    Centres,
+}
+
+/// From optical depth to transmittance, at centres.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum ExponentialChoice {
+    /// True depths along directions; right at any depth.
+    #[default]
+    Direct,
+    /// Harmonics of the depth, exponentiated along directions; good to depth 3.
+    Pointwise,
+    /// Optimal linear with scaling and squaring; good to depth 1.
+    Hybrid,
+    /// Optimal linear, the paper's; good to depth 0.5.
+    Linear,
+}
+
+/// How light that scatters more than once is found.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum MultipleChoice {
+    /// Integral transport on grid nodes.
+    Transport,
+    /// Integral transport between centres.
+    Integral,
+    /// Diffusion between centres, the paper's, corrected.
+    Diffusion,
+}
+
 /// How the addresses of the residual's voxels are stored.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
 pub enum ResidualAddress {
@@ -85,6 +132,26 @@ pub enum ResidualAddress {
     /// The smaller of the two, frame by frame.
     #[default]
     Auto,
+}
+
+/// Which Gaussians are moved to where they are needed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum TeleportRule {
+    /// Several at once, by expected gain and loss.
+    #[default]
+    Batch,
+    /// The one of least integral, to the voxel of largest error (Zhou et al. 2008).
+    Single,
+}
+
+/// How many Gaussians later frames have.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum GaussianCount {
+    /// As many as the first, as far as they are of use.
+    #[default]
+    Steady,
+    /// What deletion and insertion by the error ratio leave (Zhou et al. 2008).
+    Adaptive,
 }
 
 /// How sections lie in the pack.
@@ -110,9 +177,9 @@ pub struct BakeArgs {
     pub grid: String,
     /// Frames to bake: 1001-1064, 1001-1064x2, 1,5,9 [default: all there are].
     #[arg(long, value_name = "RANGE")]
-    pub frames: Option<String>,
-    /// Gaussians in the first frame.
-    #[arg(long, value_name = "N", default_value_t = 1000, value_parser = clap::value_parser!(u32).range(1..=65536))]
+    pub frames: Option<FrameSelection>,
+    /// Gaussians in the first frame; 0 leaves everything to the residual.
+    #[arg(long, value_name = "N", default_value_t = 1000, value_parser = clap::value_parser!(u32).range(0..=65536))]
     pub gaussians: u32,
     /// Smallest radius, in lengths of the box's longest side.
     #[arg(long, value_name = "R", default_value_t = 0.015, value_parser = positive)]
@@ -126,12 +193,21 @@ pub struct BakeArgs {
     /// Largest weight, as a part of the largest density.
     #[arg(long, value_name = "W", default_value_t = 1.0, value_parser = positive)]
     pub weight_max: f64,
-    /// Most iterations of one minimisation.
-    #[arg(long, value_name = "N", default_value_t = 500)]
-    pub max_iterations: u32,
+    /// Evaluations of the fit's error in the first frame.
+    #[arg(long, value_name = "N", default_value_t = 200)]
+    pub first_evaluations: u32,
+    /// Evaluations of the fit's error in a later frame, without those after insertions.
+    #[arg(long, value_name = "N", default_value_t = 40)]
+    pub next_evaluations: u32,
     /// Iterations between two moves of the least useful Gaussian in the first frame; 0 for never.
     #[arg(long, value_name = "N", default_value_t = 20)]
     pub teleport_every: u32,
+    /// Which Gaussians move then.
+    #[arg(long, value_enum, default_value_t)]
+    pub teleport_rule: TeleportRule,
+    /// How many Gaussians a later frame has.
+    #[arg(long, value_enum, default_value_t)]
+    pub count: GaussianCount,
     /// Error over the first frame's error at which a later frame gets another Gaussian.
     #[arg(long, value_name = "RATIO", default_value_t = 1.1, value_parser = positive)]
     pub rho: f64,
@@ -162,10 +238,10 @@ pub struct BakeArgs {
     /// Read and check the input, say what would be done, write nothing.
     #[arg(long)]
     pub dry_run: bool,
-    /// Frames per second of the sequence, kept in the pack.
-    #[arg(long, value_name = "FPS", default_value_t = 24.0, value_parser = positive)]
-    pub fps: f64,
-    /// Seed of every random choice.
+    /// Frames per second of the sequence, kept in the pack [default: not stated].
+    #[arg(long, value_name = "FPS", value_parser = positive)]
+    pub fps: Option<f64>,
+    /// Seed of the search for perfect hashes, the only random choice.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
     /// Threads; the result does not depend on it [default: one for each core].
@@ -187,24 +263,51 @@ pub struct RenderArgs {
     /// The scene file.
     #[arg(long, value_name = "SCENE")]
     pub scene: PathBuf,
-    /// The images to write, such as out.####.exr.
-    #[arg(short, long, value_name = "PATTERN")]
+    /// The images to write, such as out.####.exr; also %04d, $F4 or @@@@, or a plain name for one frame.
+    #[arg(short, long, value_name = "PATTERN", value_parser = exr_pattern)]
     pub output: PathBuf,
     /// Frames to render [default: all in the pack].
     #[arg(long, value_name = "RANGE")]
-    pub frames: Option<String>,
-    /// Order of the spherical harmonics of light and source radiance.
-    #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u8).range(1..=6))]
-    pub sh_order: u8,
+    pub frames: Option<FrameSelection>,
+    /// Where the source radiance is solved.
+    #[arg(long, value_enum, default_value_t)]
+    pub route: RouteChoice,
     /// Scattering orders.
     #[arg(long, value_enum, default_value_t)]
     pub order: ScatteringOrder,
+    /// Order of the spherical harmonics of phase function and source radiance.
+    #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u8).range(1..=6))]
+    pub sh_order: u8,
+    /// Beams that an environment is cut into (route grid) [default: 96].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=65536))]
+    pub beams: Option<u32>,
+    /// Voxels between nodes of single scattering (route grid) [default: 1, more in huge frames].
+    #[arg(long, value_name = "VOXELS", value_parser = clap::value_parser!(u32).range(1..=64))]
+    pub source_step: Option<u32>,
+    /// Voxels between nodes of multiple scattering (route grid) [default: 2; 1 in thick smoke, more in huge frames].
+    #[arg(long, value_name = "VOXELS", value_parser = clap::value_parser!(u32).range(1..=64))]
+    pub scatter_step: Option<u32>,
+    /// From optical depth to transmittance (route centres) [default: direct].
+    #[arg(long, value_enum)]
+    pub exponential: Option<ExponentialChoice>,
+    /// Light scattered more than once [default: transport with route grid, integral with route centres].
+    #[arg(long, value_enum)]
+    pub multiple: Option<MultipleChoice>,
+    /// Voxels between samples along a ray.
+    #[arg(long, value_name = "VOXELS", default_value_t = 0.5, value_parser = march_step)]
+    pub march_step: f64,
+    /// Transmittance below which a ray ends.
+    #[arg(long, value_name = "T", default_value_t = 0.001, value_parser = cutoff)]
+    pub cutoff: f64,
+    /// Rays along a side of a pixel: N x N rays a pixel.
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=64))]
+    pub samples: u8,
     /// Instead of the scene's sigma_t: a number, or R,G,B.
     #[arg(long, value_name = "RGB", value_parser = rgb)]
-    pub sigma_t: Option<[f64; 3]>,
+    pub sigma_t: Option<Rgb>,
     /// Instead of the scene's albedo: a number, or R,G,B.
     #[arg(long, value_name = "RGB", value_parser = rgb)]
-    pub albedo: Option<[f64; 3]>,
+    pub albedo: Option<Rgb>,
     /// Instead of the scene's g.
     #[arg(long, value_name = "COSINE", allow_negative_numbers = true)]
     pub g: Option<f64>,
@@ -223,10 +326,13 @@ pub struct RenderArgs {
     /// How progress is shown.
     #[arg(long, value_enum, default_value_t)]
     pub progress: ProgressMode,
-    /// Print one JSON document with seconds per stage.
+    /// Print one JSON document with settings and seconds per stage and frame.
     #[arg(long)]
     pub json: bool,
 }
+
+/// Three channels.
+pub type Rgb = [f64; 3];
 
 /// Options of `inspect`.
 #[derive(Args, Debug)]
@@ -251,21 +357,33 @@ pub struct UnpackArgs {
     /// The pack.
     pub pack: PathBuf,
     /// The volumes to write, such as out.####.vdb or out.####.vol.
-    #[arg(short, long, value_name = "PATTERN")]
+    #[arg(short, long, value_name = "PATTERN", value_parser = volume_pattern)]
     pub output: PathBuf,
     /// Frames to unpack [default: all in the pack].
     #[arg(long, value_name = "RANGE")]
-    pub frames: Option<String>,
-    /// Store densities in 16 bits instead of 32 (VDB).
-    #[arg(long, action = ArgAction::SetTrue)]
+    pub frames: Option<FrameSelection>,
+    /// Store densities in 16 bits instead of 32 (VDB only); the error that this adds is reported.
+    #[arg(long)]
     pub half: bool,
+    /// Threads; the result does not depend on it [default: one for each core].
+    #[arg(long, value_name = "N")]
+    pub threads: Option<usize>,
+    /// How progress is shown.
+    #[arg(long, value_enum, default_value_t)]
+    pub progress: ProgressMode,
 }
 
 /// Options of `demo`.
 #[derive(Args, Debug)]
 pub struct DemoArgs {
-    /// The folder to fill: a pack, rendered frames and a contact sheet.
+    /// The folder to fill: the inputs, a pack, rendered frames and a contact sheet.
     pub output: PathBuf,
+    /// Threads; the result does not depend on it [default: one for each core].
+    #[arg(long, value_name = "N")]
+    pub threads: Option<usize>,
+    /// How progress is shown.
+    #[arg(long, value_enum, default_value_t)]
+    pub progress: ProgressMode,
 }
 
 fn positive(text: &str) -> Result<f64, String> {
@@ -293,6 +411,33 @@ fn difference_path(text: &str) -> Result<PathBuf, String> {
     }
 }
 
+fn exr_pattern(text: &str) -> Result<PathBuf, String> {
+    let path = PathBuf::from(text);
+    match path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase).as_deref() {
+        Some("exr") => Ok(path),
+        _ => Err("expected a name that ends in .exr".into()),
+    }
+}
+
+fn march_step(text: &str) -> Result<f64, String> {
+    positive(text).ok().filter(|&v| v <= 4.0).ok_or_else(|| "expected voxels above 0, up to 4".into())
+}
+
+fn cutoff(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(v) if (0.0..1.0).contains(&v) => Ok(v),
+        _ => Err("expected a transmittance from 0 to below 1".into()),
+    }
+}
+
+fn volume_pattern(text: &str) -> Result<PathBuf, String> {
+    let path = PathBuf::from(text);
+    match path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase).as_deref() {
+        Some("vdb" | "vol") => Ok(path),
+        _ => Err("expected a name that ends in .vdb or .vol".into()),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -301,14 +446,6 @@ mod tests {
     #[test]
     fn the_definitions_of_all_subcommands_are_sound() {
         Cli::command().debug_assert();
-        let all = clap::Command::new("all");
-        all.subcommand(BakeArgs::augment_args(clap::Command::new("bake")))
-            .subcommand(RenderArgs::augment_args(clap::Command::new("render")))
-            .subcommand(InspectArgs::augment_args(clap::Command::new("inspect")))
-            .subcommand(ValidateArgs::augment_args(clap::Command::new("validate")))
-            .subcommand(UnpackArgs::augment_args(clap::Command::new("unpack")))
-            .subcommand(DemoArgs::augment_args(clap::Command::new("demo")))
-            .debug_assert();
     }
 
     fn parse<A: Args + FromArgMatches>(line: &[&str]) -> Result<A, clap::Error> {
@@ -323,7 +460,7 @@ mod tests {
         assert_eq!((args.psnr, args.max_error, args.residual), (Some(47.0), None, ResidualAddress::Auto));
         assert!(parse::<BakeArgs>(&["in", "-o", "a", "--psnr", "47", "--max-error", "0.1"]).is_err());
         assert!(parse::<BakeArgs>(&["in", "-o", "a", "--max-error", "nan"]).is_err());
-        assert!(parse::<BakeArgs>(&["in", "-o", "a", "--gaussians", "0"]).is_err());
+        assert!(parse::<BakeArgs>(&["in", "-o", "a", "--gaussians", "65537"]).is_err());
     }
 
     #[test]

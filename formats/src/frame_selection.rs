@@ -3,6 +3,9 @@
 //! Commas between items; an item is a frame, `first-last`, or `first-lastxstep`. Frames may be negative: `-3--1` and
 //! `-3-5` are ranges. `:` is refused, since it means a step in some programs and a range in others.
 
+use crate::{Error, Result};
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
 use std::str::FromStr;
 
 /// Which frames to take, such as `1001-1064`, `1001-1064x2`, `-3-5,10,20`.
@@ -15,6 +18,26 @@ impl FrameSelection {
     /// The ranges in the order they were given; they may overlap.
     pub(crate) fn ranges(&self) -> &[FrameRange] {
         &self.ranges
+    }
+
+    /// The places of the selected frames in `numbers`, ascending, each once. A frame asked for that is not there is an
+    /// error naming it and `path`.
+    pub fn positions(&self, path: &Path, numbers: &[i32]) -> Result<Vec<usize>> {
+        let places: BTreeMap<i32, usize> = numbers.iter().zip(0..).map(|(&n, i)| (n, i)).collect();
+        let mut chosen = BTreeSet::new();
+        for number in self.ranges.iter().flat_map(FrameRange::numbers) {
+            // The first missing frame ends it, so that a huge range costs no more than the frames that are there.
+            let Some(&place) = places.get(&number) else {
+                let (first, last) = (places.first_key_value(), places.last_key_value());
+                let expected = match (first, last) {
+                    (Some(first), Some(last)) => format!("one of the {} from {} to {}", places.len(), first.0, last.0),
+                    _ => "none, for there are no frames".to_owned(),
+                };
+                return Err(Error::invalid(path, format!("frame {number}"), "no such frame", expected));
+            };
+            chosen.insert(place);
+        }
+        Ok(chosen.into_iter().collect())
     }
 }
 
@@ -89,6 +112,18 @@ fn range(item: &str) -> std::result::Result<FrameRange, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn selected_frames_are_found_by_number_and_a_missing_one_is_named() {
+        let positions = |text: &str, numbers: &[i32]| {
+            text.parse::<FrameSelection>().unwrap().positions(Path::new("a.smoke"), numbers)
+        };
+        assert_eq!(positions("5,1-3,2", &[1, 2, 3, 5]).unwrap(), [0, 1, 2, 3]);
+        assert_eq!(positions("1-5x2", &[5, 3, 1]).unwrap(), [0, 1, 2]);
+        let message = positions("1-2000000000", &[1, 2, 3]).unwrap_err().to_string();
+        assert_eq!(message, "a.smoke: frame 4: found no such frame, expected one of the 3 from 1 to 3");
+        assert!(positions("1", &[]).unwrap_err().to_string().contains("no frames"));
+    }
 
     #[test]
     fn every_form_gives_its_frames() {

@@ -116,6 +116,34 @@ impl Sequence {
     }
 }
 
+/// The file of each frame of a sequence that is to be written.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct OutputNames(NamePattern);
+
+impl OutputNames {
+    /// The names that `pattern` gives `frames` files; one file may have a name without a pattern.
+    ///
+    /// Errors: several frames and no pattern, two patterns, no file name.
+    pub fn new(pattern: &Path, frames: usize) -> Result<Self> {
+        let folder = pattern.parent().map(Path::to_owned).unwrap_or_default();
+        let name = pattern.file_name().and_then(|n| n.to_str());
+        let expected = "a UTF-8 file name with a pattern, such as out.####.exr";
+        let name = name.ok_or_else(|| Error::invalid(pattern, "output", "no UTF-8 file name", expected))?;
+        match NamePattern::from_placeholder(pattern, &folder, name)? {
+            Some(names) => Ok(Self(names)),
+            None if frames <= 1 => {
+                Ok(Self(NamePattern { folder, prefix: name.to_owned(), width: 0, suffix: String::new() }))
+            }
+            None => Err(Error::invalid(pattern, "output", format!("one name for {frames} frames"), expected)),
+        }
+    }
+
+    /// The file of frame `number`.
+    pub fn path(&self, number: i32) -> PathBuf {
+        self.0.folder.join(self.0.file_name(number))
+    }
+}
+
 /// A file name around a frame number.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct NamePattern {
@@ -296,6 +324,22 @@ mod tests {
     fn numbers(folder: &tempfile::TempDir, name: &str) -> Vec<i32> {
         let found = Sequence::find(folder.path().join(name).to_str().unwrap()).unwrap();
         found.frames().iter().map(|f| f.number).collect()
+    }
+
+    #[test]
+    fn files_to_write_are_named_by_every_pattern_and_a_plain_name_serves_one_frame() {
+        let named = |pattern: &str, number| OutputNames::new(Path::new(pattern), 3).map(|n| n.path(number));
+        for pattern in ["a/out.####.exr", "a/out.#.exr", "a/out.@@@@.exr", "a/out.%04d.exr", "a/out.$F4.exr"] {
+            assert_eq!(named(pattern, 7).unwrap(), Path::new("a/out.0007.exr"), "{pattern}");
+            assert_eq!(named(pattern, -7).unwrap(), Path::new("a/out.-0007.exr"), "{pattern}");
+            assert_eq!(named(pattern, 123_456).unwrap(), Path::new("a/out.123456.exr"), "{pattern}");
+        }
+        assert_eq!(OutputNames::new(Path::new("one.exr"), 1).unwrap().path(7), Path::new("one.exr"));
+        for (pattern, found) in [("one.exr", "one name for 3 frames"), ("##_##.exr", "2 patterns"), ("..", "no UTF-8")]
+        {
+            let message = named(pattern, 7).unwrap_err().to_string();
+            assert!(message.contains(found), "{message}");
+        }
     }
 
     #[test]

@@ -3,7 +3,7 @@
 /// One pixel.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pixel {
-    /// Radiance that comes from the medium, RGB: premultiplied by nature, without any background.
+    /// Radiance that comes from the medium, RGB, premultiplied by nature; and that of visible environments behind it.
     pub radiance: [f32; 3],
     /// Fraction of the background that is seen, per channel, in [0, 1].
     pub transmittance: [f32; 3],

@@ -1,6 +1,7 @@
 //! Light in a participating medium: a frame of a pack becomes a density, density and lights become source radiance,
 //! and a march through both becomes an image.
 
+pub mod backdrop;
 pub mod camera;
 pub mod film;
 pub mod image_difference;
@@ -8,5 +9,6 @@ pub mod lanes;
 pub mod light;
 pub mod march;
 pub mod medium;
+pub mod renderer;
 pub mod sphere;
 pub mod transport;

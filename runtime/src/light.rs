@@ -7,10 +7,13 @@
 //! Cost: O(texels log beams), after texels were pooled to at most [`POOLED_WIDTH`] across.
 
 use glam::{DVec3, Vec3};
+use rayon::prelude::*;
 
 /// Environments wider than this are pooled before they are cut into cells: a texel of 1.4 degrees, far below the size
 /// of any cell, and its flux and mean direction are kept exactly.
 const POOLED_WIDTH: usize = 256;
+/// Samples across, at least, when an environment is averaged over cells.
+const CELL_SAMPLES: usize = 512;
 
 /// A latitude-longitude environment of radiance: linear Rec.709, row 0 at the zenith.
 ///
@@ -28,12 +31,14 @@ pub struct Environment {
     pub rotation: f64,
     /// True if y is up in the world, false if z is.
     pub up_is_y: bool,
+    /// True if the camera sees it behind the smoke.
+    pub visible: bool,
 }
 
 impl Environment {
     /// The same radiance from everywhere.
     pub fn constant(radiance: [f32; 3]) -> Self {
-        Self { width: 64, height: 32, radiance: vec![radiance; 64 * 32], rotation: 0.0, up_is_y: false }
+        Self { width: 64, height: 32, radiance: vec![radiance; 64 * 32], rotation: 0.0, up_is_y: false, visible: false }
     }
 
     /// Unit direction, world space, of texel coordinates (`u`, `v`) in [0, 1].
@@ -52,6 +57,38 @@ impl Environment {
         let column = ((u - u.floor()) * self.width as f64) as usize;
         let row = ((v * self.height as f64) as usize).min(self.height - 1);
         self.radiance[row * self.width + column.min(self.width - 1)]
+    }
+
+    /// Mean radiance over each of `count` cells of a partition of the sphere, of which `cell` tells the one of a unit
+    /// direction, world space. Texels are sampled in their middle, or on a grid where they are larger than
+    /// 2 pi / [`CELL_SAMPLES`]. A cell that no sample falls in gets zero.
+    pub fn mean_over_cells(&self, count: usize, cell: impl Fn(DVec3) -> usize + Sync) -> Vec<[f64; 3]> {
+        let split = CELL_SAMPLES.div_ceil(self.width);
+        let rows = self.height * split;
+        let row_sums = (0..rows).into_par_iter().map(|row| {
+            let (top, bottom) = (row as f64 / rows as f64, (row + 1) as f64 / rows as f64);
+            let solid_angle = (std::f64::consts::PI * top).cos() - (std::f64::consts::PI * bottom).cos();
+            let mut sums: Vec<(usize, [f64; 4])> = Vec::new();
+            for column in 0..self.width * split {
+                let direction =
+                    self.direction((column as f64 + 0.5) / (self.width * split) as f64, 0.5 * (top + bottom));
+                let radiance = self.radiance[row / split * self.width + column / split];
+                let at = cell(direction);
+                if sums.last().is_none_or(|(last, _)| *last != at) {
+                    sums.push((at, [0.0; 4]));
+                }
+                if let Some((_, sum)) = sums.last_mut() {
+                    (0..3).for_each(|c| sum[c] += f64::from(radiance[c]) * solid_angle);
+                    sum[3] += solid_angle;
+                }
+            }
+            sums
+        });
+        let mut cells = vec![[0.0f64; 4]; count];
+        for (at, sum) in row_sums.collect::<Vec<_>>().into_iter().flatten() {
+            (0..4).for_each(|c| cells[at][c] += sum[c]);
+        }
+        cells.iter().map(|s| [0, 1, 2].map(|c| if s[3] > 0.0 { s[c] / s[3] } else { 0.0 })).collect()
     }
 
     /// The pooled texels as small beams: exact flux, exact mean direction.

@@ -34,12 +34,14 @@ pub struct MarchSettings {
     pub step: f32,
     /// A ray ends where its transmittance falls below this; what is left is taken to be as bright as there.
     pub cutoff: f32,
+    /// Rays along a side of a pixel: `samples^2` on a regular grid, at least 1.
+    pub samples: usize,
 }
 
 impl Default for MarchSettings {
-    /// Half a voxel, as in the paper, and one part in a thousand.
+    /// Half a voxel, as in the paper, one part in a thousand, and one ray a pixel.
     fn default() -> Self {
-        Self { step: 0.5, cutoff: 1e-3 }
+        Self { step: 0.5, cutoff: 1e-3, samples: 1 }
     }
 }
 
@@ -94,25 +96,99 @@ fn lerp(a: [f32; 4], b: [f32; 4], f: f32) -> [f32; 4] {
     [0, 1, 2, 3].map(|c| a[c] + (b[c] - a[c]) * f)
 }
 
-/// Marches every pixel. `sigma_t` is extinction per unit density and world length, per channel.
-pub fn march(volume: &ShadedVolume, camera: &Camera, sigma_t: [f32; 3], settings: &MarchSettings) -> Film {
+/// What is seen where the medium lets light through, by unit direction, world space.
+pub trait Backdrop: Sync {
+    /// Radiance behind the medium that the camera sees.
+    fn behind(&self, direction: DVec3) -> [f32; 3];
+    /// Radiance that a forward peak which counts as not scattered brings along this direction.
+    fn through_peak(&self, direction: DVec3) -> [f32; 3];
+}
+
+/// Nothing behind the medium.
+pub struct Black;
+
+impl Backdrop for Black {
+    fn behind(&self, _: DVec3) -> [f32; 3] {
+        [0.0; 3]
+    }
+    fn through_peak(&self, _: DVec3) -> [f32; 3] {
+        [0.0; 3]
+    }
+}
+
+/// What the march is told of the medium.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct MarchMedium {
+    /// Extinction per unit density and world length that the source radiance was made for.
+    pub sigma_t: [f32; 3],
+    /// The user's extinction over that: 1, or more where part of the forward peak counts as not scattered.
+    pub peak_ratio: [f32; 3],
+}
+
+impl MarchMedium {
+    /// A medium without a peak taken out.
+    pub fn plain(sigma_t: [f32; 3]) -> Self {
+        Self { sigma_t, peak_ratio: [1.0; 3] }
+    }
+
+    /// From the user's extinction and the one of the source radiance.
+    pub fn of(user: [f32; 3], marched: [f32; 3]) -> Self {
+        let ratio = |c: usize| if user[c] > marched[c] && marched[c] > 0.0 { user[c] / marched[c] } else { 1.0 };
+        Self { sigma_t: marched, peak_ratio: [0, 1, 2].map(ratio) }
+    }
+}
+
+/// Marches every pixel.
+pub fn march(
+    volume: &ShadedVolume,
+    camera: &Camera,
+    medium: &MarchMedium,
+    backdrop: &dyn Backdrop,
+    settings: &MarchSettings,
+) -> Film {
     let node_from_world = volume.world_from_node.inverse();
     let voxel = (0..3).map(|a| volume.world_from_node.matrix3.col(a).length()).fold(f64::INFINITY, f64::min);
     let ds = voxel * f64::from(settings.step);
+    let origin = node_from_world.transform_point3(camera.position);
+    let side = settings.samples;
     let mut film = Film::new(camera.width, camera.height);
     film.pixels.par_chunks_mut(camera.width).enumerate().for_each(|(y, row)| {
         for (x, pixel) in row.iter_mut().enumerate() {
-            let world = camera.direction(x, y);
-            let ray = Ray {
-                origin: node_from_world.transform_point3(camera.position),
-                direction: node_from_world.transform_vector3(world),
-                ds,
-                depth_per_distance: world.dot(camera.forward),
-            };
-            *pixel = march_ray(volume, &ray, sigma_t, settings.cutoff);
+            let (mut radiance, mut transmittance, mut depth) = ([0.0f32; 3], [0.0f32; 3], f32::INFINITY);
+            for sample in 0..side * side {
+                let at = |pixel: usize, step: usize| pixel as f64 + (step as f64 + 0.5) / side as f64;
+                let world = camera.direction(at(x, sample % side), at(y, sample / side));
+                let direction = node_from_world.transform_vector3(world);
+                let ray = Ray { origin, direction, ds, depth_per_distance: world.dot(camera.forward) };
+                let marched = march_ray(volume, &ray, medium.sigma_t, settings.cutoff);
+                let seen = before(marched, medium, backdrop, world);
+                (0..3).for_each(|c| radiance[c] += seen.radiance[c]);
+                (0..3).for_each(|c| transmittance[c] += seen.transmittance[c]);
+                depth = depth.min(seen.depth);
+            }
+            let share = 1.0 / (side * side) as f32;
+            *pixel =
+                Pixel { radiance: radiance.map(|r| r * share), transmittance: transmittance.map(|t| t * share), depth };
         }
     });
     film
+}
+
+/// A marched ray in front of the backdrop. The background is seen through the user's extinction, `T^ratio`; what the
+/// marched extinction lets through beyond that, `T - T^ratio`, is light of the forward peak, and belongs to the medium.
+fn before(marched: Pixel, medium: &MarchMedium, backdrop: &dyn Backdrop, direction: DVec3) -> Pixel {
+    let mut pixel = marched;
+    let behind = backdrop.behind(direction);
+    if medium.peak_ratio != [1.0; 3] {
+        let peak = backdrop.through_peak(direction);
+        for c in 0..3 {
+            let through = marched.transmittance[c];
+            pixel.transmittance[c] = through.powf(medium.peak_ratio[c]);
+            pixel.radiance[c] += (through - pixel.transmittance[c]) * peak[c];
+        }
+    }
+    (0..3).for_each(|c| pixel.radiance[c] += pixel.transmittance[c] * behind[c]);
+    pixel
 }
 
 /// A ray in node space; distances along it are in world units.
@@ -208,11 +284,15 @@ mod tests {
         (volume, camera)
     }
 
+    fn see(volume: &ShadedVolume, camera: &Camera, sigma_t: [f32; 3], settings: &MarchSettings) -> Film {
+        march(volume, camera, &MarchMedium::plain(sigma_t), &Black, settings)
+    }
+
     #[test]
     fn a_slab_transmits_by_beer_and_lambert_at_any_optical_depth() {
         for depth in [1e-6f32, 1e-3, 0.1, 1.0, 5.0, 20.0, 1e3, 1e6] {
             let (volume, camera) = slab(1.0, 2.0);
-            let film = march(&volume, &camera, [depth / 8.0; 3], &MarchSettings { step: 0.25, cutoff: 0.0 });
+            let film = see(&volume, &camera, [depth / 8.0; 3], &MarchSettings { step: 0.25, cutoff: 0.0, samples: 1 });
             let pixel = film.pixels[4];
             let truth = (-f64::from(depth)).exp();
             // The midpoint rule is exact on the linear edges but for the sample that holds the kink.
@@ -227,16 +307,56 @@ mod tests {
         let (volume, camera) = slab(1.0, 1.0);
         let mut dense = slab(1.0, 1.0).0;
         dense.occupied.fill(true);
-        let settings = MarchSettings { step: 0.5, cutoff: 0.0 };
-        let (a, b) = (march(&volume, &camera, [0.3; 3], &settings), march(&dense, &camera, [0.3; 3], &settings));
+        let settings = MarchSettings { step: 0.5, cutoff: 0.0, samples: 1 };
+        let (a, b) = (see(&volume, &camera, [0.3; 3], &settings), see(&dense, &camera, [0.3; 3], &settings));
         assert_eq!(a.pixels, b.pixels);
-        let early = march(&volume, &camera, [2.0; 3], &MarchSettings { cutoff: 1e-3, ..settings });
+        let early = see(&volume, &camera, [2.0; 3], &MarchSettings { cutoff: 1e-3, ..settings });
         assert!((early.pixels[4].radiance[0] - 1.0).abs() < 1e-5, "a constant source stays constant");
     }
 
     #[test]
     fn no_density_on_the_way_leaves_the_pixel_empty() {
         let (volume, camera) = slab(0.0, 1.0);
-        assert_eq!(march(&volume, &camera, [1.0; 3], &MarchSettings::default()).pixels[4], Pixel::EMPTY);
+        assert_eq!(see(&volume, &camera, [1.0; 3], &MarchSettings::default()).pixels[4], Pixel::EMPTY);
+    }
+
+    #[test]
+    fn a_peak_taken_out_of_the_extinction_is_in_the_radiance_and_not_in_the_transmittance() {
+        struct Sky;
+        impl Backdrop for Sky {
+            fn behind(&self, _: DVec3) -> [f32; 3] {
+                [1.0, 0.0, 1.0]
+            }
+            fn through_peak(&self, _: DVec3) -> [f32; 3] {
+                [1.0; 3]
+            }
+        }
+        let (volume, camera) = slab(1.0, 1.0);
+        let medium = MarchMedium::of([0.2; 3], [0.1; 3]);
+        let pixel = march(&volume, &camera, &medium, &Sky, &MarchSettings::default()).pixels[4];
+        let truth = (-1.6f32).exp();
+        assert!((pixel.transmittance[0] - truth).abs() < 1e-3 * truth, "{pixel:?}");
+        // The furnace: a source of 1, a sky of 1, behind a peak of 1.
+        assert!((pixel.radiance[0] - 1.0).abs() < 1e-6 && (pixel.radiance[1] - (1.0 - truth)).abs() < 1e-3);
+        let plain = march(&volume, &camera, &MarchMedium::plain([0.1; 3]), &Sky, &MarchSettings::default()).pixels[4];
+        assert!((plain.radiance[0] - 1.0).abs() < 1e-6 && (plain.transmittance[1] - (-0.8f32).exp()).abs() < 1e-3);
+    }
+
+    #[test]
+    fn more_rays_a_pixel_average_what_they_see() {
+        // A sky that is bright on the right half of the middle pixel: one ray in its middle cannot tell.
+        struct Half;
+        impl Backdrop for Half {
+            fn behind(&self, d: DVec3) -> [f32; 3] {
+                [if d.x > 1e-9 { 1.0 } else { 0.0 }; 3]
+            }
+            fn through_peak(&self, _: DVec3) -> [f32; 3] {
+                [0.0; 3]
+            }
+        }
+        let (volume, camera) = slab(0.0, 1.0);
+        let settings = MarchSettings { samples: 4, ..MarchSettings::default() };
+        let film = march(&volume, &camera, &MarchMedium::plain([1.0; 3]), &Half, &settings);
+        assert_eq!([3, 4, 5].map(|p| film.pixels[p].radiance[0]), [0.0, 0.5, 1.0]);
     }
 }

@@ -61,14 +61,12 @@ pub fn decode_gaussians(path: &Path, what: &str, bytes: &[u8], codec: Codec, res
     Ok(list)
 }
 
-/// A rank section at rest, and the number of its resident bytes.
-pub fn encode_rank(codes: &ResidualCodes, codec: Codec) -> (Vec<u8>, u64) {
-    let resident = rank::encode(codes);
-    let length = resident.len() as u64;
+/// A rank section at rest; `resident` is the rank layout of `codes`.
+pub fn encode_rank(codes: &ResidualCodes, resident: &[u8], codec: Codec) -> Vec<u8> {
     match codec {
-        Codec::Coded => (coded::encode(codes), length),
-        Codec::Deflate => (deflate(&resident), length),
-        Codec::Raw | Codec::Snapped => (resident, length),
+        Codec::Coded => coded::encode(codes),
+        Codec::Deflate => deflate(resident),
+        Codec::Raw | Codec::Snapped => resident.to_vec(),
     }
 }
 
@@ -157,9 +155,10 @@ mod tests {
         let path = Path::new("p");
         for frame in frames_of_every_kind() {
             for codec in CODECS {
-                let (bytes, resident) = encode_rank(&frame, codec);
-                let back = decode_rank(path, bytes, codec, resident).unwrap();
-                assert_eq!(back.bytes(), rank::encode(&frame));
+                let resident = rank::encode(&frame);
+                let bytes = encode_rank(&frame, &resident, codec);
+                let back = decode_rank(path, bytes, codec, resident.len() as u64).unwrap();
+                assert_eq!(back.bytes(), resident);
                 assert_eq!(back.codes(0).unwrap(), frame);
             }
         }
@@ -182,12 +181,13 @@ mod tests {
     fn every_prefix_an_extra_byte_and_a_wrong_length_are_refused_by_every_codec() {
         let path = Path::new("p");
         let frames = [ball([9, 8, 7], 60, 1)];
+        let resident = rank::encode(&frames[0]);
         let hash = |codec, bytes: &[u8], resident| decode_hash(path, bytes.to_vec(), codec, resident);
         let rank = |codec, bytes: &[u8], resident| decode_rank(path, bytes.to_vec(), codec, resident);
         type Decode<'a> = &'a dyn Fn(Codec, &[u8], u64) -> Result<Residual>;
         for codec in CODECS {
             let kinds: [(Decode, (Vec<u8>, u64)); 2] = [
-                (&rank, encode_rank(&frames[0], codec)),
+                (&rank, (encode_rank(&frames[0], &resident, codec), resident.len() as u64)),
                 (&hash, encode_hash(path, &frames, &trivial(&frames), codec).unwrap()),
             ];
             for (decode, (bytes, resident)) in kinds {

@@ -4,13 +4,14 @@
 //! only copies. The bytes of [`EncodedFrame::to_bytes`] are for a bake's own work files, which an interrupted bake
 //! finds again; they carry a checksum and are no part of the pack's format.
 
-use super::at_rest::{decode_gaussians, decode_rank, deflate, encode_rank};
+use super::at_rest::{decode_gaussians, deflate, encode_rank};
 use super::gaussians::{self, GAUSSIAN_BYTES};
 use super::records::{self, Codec, FrameRecord, ResidualKind};
 use super::writer::{AtRest, FrameData};
 use crate::bounded::Bytes;
 use crate::gaussian::Gaussian;
 use crate::residual::ResidualCodes;
+use crate::residual::rank::{self, RankView};
 use crate::{Error, Result};
 use std::path::Path;
 use xxhash_rust::xxh3::xxh3_64;
@@ -24,6 +25,8 @@ pub struct EncodedFrame {
     pub(super) at_rest: AtRest,
     pub(super) gaussians: Vec<u8>,
     pub(super) residual: Vec<u8>,
+    /// The residual's rank layout, resident: the quick way back to the codes.
+    ranks: Vec<u8>,
 }
 
 impl EncodedFrame {
@@ -39,19 +42,20 @@ impl EncodedFrame {
             Codec::Snapped => gaussians::encode(path, frame.gaussians)?,
             Codec::Coded => return Err(Error::invalid(path, "gaussians.codec", "Coded", "Raw, Deflate, Snapped")),
         };
-        let (residual, residual_resident) = encode_rank(frame.codes, at_rest.residual);
+        let ranks = rank::encode(frame.codes);
+        let residual = encode_rank(frame.codes, &ranks, at_rest.residual);
         let record = FrameRecord {
             origin: frame.codes.origin,
             dims: frame.codes.dims,
             active_voxels: frame.codes.codes.len() as u64,
             gaussians: frame.gaussians.len() as u32,
             residual: ResidualKind::Rank,
-            rank_bytes: residual_resident,
+            rank_bytes: ranks.len() as u64,
             bytes_at_rest: (gaussians.len() + residual.len()) as u64,
-            bytes_resident: gaussians_resident + residual_resident,
+            bytes_resident: gaussians_resident + ranks.len() as u64,
             ..frame.record
         };
-        Ok(Self { record, at_rest, gaussians, residual })
+        Ok(Self { record, at_rest, gaussians, residual, ranks })
     }
 
     /// What is known of the frame.
@@ -70,9 +74,9 @@ impl EncodedFrame {
         decode_gaussians(path, "frame", &self.gaussians, self.at_rest.gaussians, resident)
     }
 
-    /// The residual, decoded.
-    pub fn decode_codes(&self, path: &Path) -> Result<ResidualCodes> {
-        decode_rank(path, self.residual.clone(), self.at_rest.residual, self.record.rank_bytes)?.codes(0)
+    /// The residual.
+    pub fn codes(&self, path: &Path) -> Result<ResidualCodes> {
+        Ok(RankView::new(path, &self.ranks[..])?.codes())
     }
 
     /// The frame as bytes of a work file.
@@ -83,10 +87,11 @@ impl EncodedFrame {
             &(self.record, [self.at_rest.gaussians as u32, self.at_rest.residual as u32]),
         )?;
         let mut bytes = MAGIC.to_vec();
-        for part in [&record, &self.gaussians, &self.residual] {
+        let parts = [&record, &self.gaussians, &self.residual, &self.ranks];
+        for part in parts {
             bytes.extend((part.len() as u64).to_le_bytes());
         }
-        [&record, &self.gaussians, &self.residual].iter().for_each(|part| bytes.extend(*part));
+        parts.iter().for_each(|part| bytes.extend(*part));
         bytes.extend(xxh3_64(&bytes).to_le_bytes());
         Ok(bytes)
     }
@@ -101,7 +106,7 @@ impl EncodedFrame {
         if head.remaining() < 8 || xxh3_64(&bytes[..sum]).to_le_bytes() != bytes[sum..] {
             return Err(head.invalid("checksum", "another", "that of the bytes before it"));
         }
-        let mut lengths = [0; 3];
+        let mut lengths = [0; 4];
         for length in &mut lengths {
             *length = usize::try_from(head.u64("length")?).unwrap_or(usize::MAX);
         }
@@ -109,13 +114,14 @@ impl EncodedFrame {
         let (record, codecs): (FrameRecord, [u32; 2]) = records::decode(path, "frame", record)?;
         let gaussians = head.take(lengths[1], "gaussians")?.to_vec();
         let residual = head.take(lengths[2], "residual")?.to_vec();
+        let ranks = head.take(lengths[3], "ranks")?.to_vec();
         head.take(8, "checksum")?;
         head.finish("end")?;
         let codec = |number: u32| {
             Codec::from_number(number).ok_or_else(|| Error::invalid(path, "codec", number, "a codec's number"))
         };
         let at_rest = AtRest { gaussians: codec(codecs[0])?, residual: codec(codecs[1])? };
-        Ok(Self { record, at_rest, gaussians, residual })
+        Ok(Self { record, at_rest, gaussians, residual, ranks })
     }
 }
 
@@ -137,7 +143,7 @@ mod tests {
             let bytes = frame.to_bytes(path).unwrap();
             let back = EncodedFrame::from_bytes(path, &bytes).unwrap();
             assert_eq!(back, frame);
-            assert_eq!(back.decode_codes(path).unwrap(), codes);
+            assert_eq!(back.codes(path).unwrap(), codes);
             assert_eq!(back.decode_gaussians(path).unwrap(), gaussians);
             for cut in 0..bytes.len() {
                 assert!(EncodedFrame::from_bytes(path, &bytes[..cut]).is_err(), "cut at {cut}");

@@ -133,6 +133,11 @@ impl Pack {
         self.header.file_bytes
     }
 
+    /// XXH3-64 of the table of contents, which holds the checksums of all sections: it tells packs apart.
+    pub fn checksum(&self) -> u64 {
+        self.header.toc_checksum
+    }
+
     /// The table of contents.
     pub fn sections(&self) -> &[SectionRecord] {
         &self.toc

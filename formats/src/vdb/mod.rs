@@ -33,7 +33,7 @@ use directory::Directory;
 use std::path::Path;
 
 pub(crate) use header::MAGIC;
-pub use write::{WriteOptions, write};
+pub use write::{WriteOptions, half_rounding, write};
 
 /// What a file says about one of its grids.
 #[derive(Clone, Debug, PartialEq, Eq, serde::Serialize)]

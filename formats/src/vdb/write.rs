@@ -36,6 +36,12 @@ pub fn write(path: &Path, grid: &DensityGrid, options: &WriteOptions) -> Result<
     atomic::write_bytes(path, &to_bytes(path, grid, options)?)
 }
 
+/// How far half floats move the value they move most: what [`WriteOptions::half`] adds to any error before it.
+pub fn half_rounding(grid: &DensityGrid) -> f64 {
+    let off = |v: f32| (f64::from(f16::from_f32(v).to_f32()) - f64::from(v)).abs();
+    grid.values.iter().fold(0.0, |most: f64, &v| most.max(off(v)))
+}
+
 struct LeafPlace {
     /// Root child, slot in it, slot in that: the order of the file.
     order: ([i32; 3], usize, usize),

@@ -2,5 +2,6 @@
 
 pub mod decoder;
 pub mod field;
+pub mod frame;
 pub mod gaussian_points;
 pub mod gaussian_sum;

@@ -66,17 +66,27 @@ impl MediumParameters {
         Ok(())
     }
 
+    /// The medium for single scattering alone, order 1 to 6: nothing counts as not scattered, because every order of the
+    /// peak but the first would come with it. Both peaks are windowed instead, as the backward one is in
+    /// [`Self::banded`]: bright enough on the whole, but wider than it is.
+    pub fn windowed(&self, order: usize) -> BandedMedium {
+        let g = f64::from(self.g);
+        let ramp = peak_ramp(g);
+        let moments = std::array::from_fn(|l| {
+            let window = if l < order { 1.0 + ramp * (cesaro(order, l) - 1.0) } else { 0.0 };
+            (window * g.powi(l as i32)) as f32
+        });
+        BandedMedium { sigma_t: self.sigma_t, albedo: self.albedo, moments }
+    }
+
     /// The medium for a phase function of `order` bands (1 to 6).
     pub fn banded(&self, order: usize) -> BandedMedium {
         let g = f64::from(self.g);
-        let ramp = ((g.abs() - f64::from(PLAIN_LIMIT)) / f64::from(FULL_LIMIT - PLAIN_LIMIT)).clamp(0.0, 1.0);
-        let ramp = ramp * ramp * (3.0 - 2.0 * ramp);
+        let ramp = peak_ramp(g);
         let peak = if g > 0.0 { ramp * g.powi(order as i32) } else { 0.0 };
         let mut moments = [0.0; 6];
         for (l, moment) in moments.iter_mut().enumerate().take(order) {
-            let (n, k) = (order as f64, l as f64);
-            let window = (n - k) * (n - k + 1.0) / (n * (n + 1.0));
-            let window = if g < 0.0 { 1.0 + ramp * (window - 1.0) } else { 1.0 };
+            let window = if g < 0.0 { 1.0 + ramp * (cesaro(order, l) - 1.0) } else { 1.0 };
             *moment = (window * (g.powi(l as i32) - peak) / (1.0 - peak)) as f32;
         }
         let kept = self.albedo.map(|a| 1.0 - f64::from(a) * peak);
@@ -86,6 +96,18 @@ impl MediumParameters {
             moments,
         }
     }
+}
+
+/// How far the peak is treated: 0 up to [`PLAIN_LIMIT`], 1 from [`FULL_LIMIT`] on.
+fn peak_ramp(g: f64) -> f64 {
+    let ramp = ((g.abs() - f64::from(PLAIN_LIMIT)) / f64::from(FULL_LIMIT - PLAIN_LIMIT)).clamp(0.0, 1.0);
+    ramp * ramp * (3.0 - 2.0 * ramp)
+}
+
+/// Weight of band `l < order` with which the series of a positive function stays positive.
+fn cesaro(order: usize, l: usize) -> f64 {
+    let (n, k) = (order as f64, l as f64);
+    (n - k) * (n - k + 1.0) / (n * (n + 1.0))
 }
 
 #[cfg(test)]
@@ -142,9 +164,22 @@ mod tests {
             let lowest =
                 |moments: &[f32; 6]| (0..=200).map(|i| value(moments, i as f64 / 100.0 - 1.0)).fold(9.0, f64::min);
             assert!(lowest(&medium(-0.99).banded(order).moments) > -1e-6, "order {order}");
+            assert!(lowest(&medium(0.99).windowed(order).moments) > -1e-6, "order {order}");
             if order > 1 {
                 let plain: [f32; 6] = std::array::from_fn(|l| if l < order { (-0.99f32).powi(l as i32) } else { 0.0 });
                 assert!(lowest(&plain) < -0.5, "the plain series must ring, or the test shows nothing");
+            }
+        }
+    }
+
+    #[test]
+    fn single_scattering_keeps_extinction_and_albedo_at_any_g() {
+        for g in [-0.99, -0.5, 0.0, 0.5, 0.65, 0.99] {
+            for order in 1..=6 {
+                let banded = medium(g).windowed(order);
+                assert_eq!((banded.sigma_t, banded.albedo), (medium(g).sigma_t, medium(g).albedo));
+                assert!(banded.moments[0] == 1.0 && banded.moments[order..].iter().all(|&m| m == 0.0));
+                assert!(g.abs() > 0.6 || (1..order).all(|l| banded.moments[l] == f64::from(g).powi(l as i32) as f32));
             }
         }
     }

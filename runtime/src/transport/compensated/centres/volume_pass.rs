@@ -16,8 +16,8 @@ use smoke_formats::gaussian::UnitSpace;
 
 use crate::medium::gaussian_points::GaussianPoints;
 use crate::sphere::harmonics::{MAX_COEFFICIENTS, evaluate};
-use crate::transport::compensated::centres::CentreRadiance;
-use crate::transport::compensated::decay::decay;
+use crate::transport::compensated::centres::decay::decay;
+use crate::transport::compensated::centres::single::CentreRadiance;
 
 /// Radii after which a Gaussian ends.
 const CUT: f32 = 3.0;
@@ -177,7 +177,7 @@ fn interpolate(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::transport::compensated::testing::{Pcg, cloud, points};
+    use crate::transport::compensated::centres::testing::{Pcg, cloud, points};
     use smoke_formats::gaussian::Gaussian;
 
     fn random(n: usize, order: usize) -> CentreRadiance {

@@ -15,9 +15,9 @@ use crate::medium::gaussian_points::LANES;
 use crate::sphere::harmonics::{BAND, MAX_COEFFICIENTS, MAX_ORDER, evaluate, limit_to_positive};
 use crate::sphere::quadrature::Directions;
 use crate::sphere::triple::add_product;
-use crate::transport::compensated::decay::decay;
-use crate::transport::compensated::depth::DirectionalDepth;
-use crate::transport::compensated::exponential::{hybrid, optimal_linear};
+use crate::transport::compensated::centres::decay::decay;
+use crate::transport::compensated::centres::depth::DirectionalDepth;
+use crate::transport::compensated::centres::exponential::{hybrid, optimal_linear};
 use crate::transport::medium::BandedMedium;
 
 /// Receivers of one task.
@@ -225,8 +225,8 @@ pub fn scatter_harmonics(
 mod tests {
     use super::*;
     use crate::medium::gaussian_points::GaussianPoints;
-    use crate::transport::compensated::testing::{Pcg, cloud, points};
-    use crate::transport::compensated::zonal::ray_depth;
+    use crate::transport::compensated::centres::testing::{Pcg, cloud, points};
+    use crate::transport::compensated::centres::zonal::ray_depth;
     use crate::transport::medium::MediumParameters;
 
     fn grey(albedo: f32, g: f32) -> BandedMedium {
@@ -310,8 +310,8 @@ mod tests {
         let (scale, medium) = (0.5, grey(1.0, 0.3));
         let expected = direct(&set, scale, &medium, &light, &d);
         let radiance = light.harmonics(4, &d);
-        let depth = crate::transport::compensated::depth::harmonic_depth(&set, 4);
-        let six = crate::transport::compensated::depth::harmonic_depth(&set, 6);
+        let depth = crate::transport::compensated::centres::depth::harmonic_depth(&set, 4);
+        let six = crate::transport::compensated::centres::depth::harmonic_depth(&set, 6);
         let pointwise = evaluate_depth(&six, 6, &d);
         let results = [
             scatter_harmonics(&depth, 4, false, [scale; 3], &medium, &radiance),

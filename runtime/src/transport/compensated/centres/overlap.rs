@@ -9,7 +9,7 @@
 use rayon::prelude::*;
 
 use crate::medium::gaussian_points::GaussianPoints;
-use crate::transport::compensated::decay::decay;
+use crate::transport::compensated::centres::decay::decay;
 
 /// Cells along the longest side of the box, at most.
 const RESOLUTION: f64 = 64.0;
@@ -173,7 +173,7 @@ fn visit(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::transport::compensated::testing::{Pcg, cloud, points};
+    use crate::transport::compensated::centres::testing::{Pcg, cloud, points};
 
     #[test]
     fn shares_sum_to_one_where_there_is_density() {

@@ -7,14 +7,14 @@
 //! Cost: O(nodes x beams) + O(coarse nodes x ordinates x iterations); see [`super::single`] and [`super::scatter`].
 
 use super::columns::SweepGrid;
-use super::krylov;
 use super::scatter::{Ordinate, gather};
 use super::single::{WeightedBeam, single_scattering};
-use crate::light::{Beam, Light, beams};
+use crate::light::Beam;
 use crate::march::ShadedVolume;
 use crate::medium::field::DensityField;
 use crate::sphere::harmonics::{BAND, MAX_ORDER, evaluate};
 use crate::sphere::quadrature::Directions;
+use crate::transport::compensated::gmres;
 use crate::transport::medium::BandedMedium;
 use crate::transport::{ScatteringOrder, SourceRadiance};
 use glam::DVec3;
@@ -97,32 +97,53 @@ pub struct GridSource {
     pub residual: f64,
 }
 
-/// Solves for the source radiance of one frame under `lights`.
-pub fn solve(
-    field: &DensityField,
-    lights: &[Light],
-    medium: &BandedMedium,
-    scattering: ScatteringOrder,
-    settings: &GridSettings,
-) -> GridSource {
-    let bands = (1..=MAX_ORDER).rev().find(|&b| medium.moments[b - 1].abs() > 1e-6).unwrap_or(1);
-    let beams = beams(lights, settings.beams);
-    let step = if settings.single_step == 0 { single_step(field) } else { settings.single_step };
-    let single = single_layer(field, step, &beams, medium, bands);
-    let scatters = medium.albedo.iter().any(|&a| a > 0.0) && medium.sigma_t.iter().any(|&s| s > 0.0);
-    if scattering == ScatteringOrder::Single || !scatters || beams.is_empty() {
-        return GridSource { single, multiple: None, iterations: 0, residual: 0.0 };
-    }
-    let thickest = medium.sigma_t.iter().copied().fold(0.0, f32::max);
-    let step = if settings.multiple_step == 0 { multiple_step(field, thickest) } else { settings.multiple_step };
-    let bands = bands.min(settings.multiple_order.max(1));
-    let first = single_layer(field, step, &beams, medium, bands);
-    let (multiple, iterations, residual) = multiple_layer(field, first, medium, bands, settings);
-    GridSource { single, multiple: Some(multiple), iterations, residual }
+/// One frame on the grids that sweeps need, ready to be lit. Its grids depend on the frame and their spacing alone.
+pub struct GridTransport {
+    settings: GridSettings,
+    grids: Vec<(usize, SweepGrid)>,
 }
 
-fn single_layer(field: &DensityField, step: usize, beams: &[Beam], medium: &BandedMedium, bands: usize) -> Layer {
-    let grid = SweepGrid::new(&field.coarsened(step));
+impl GridTransport {
+    /// Makes no grid yet: their spacing depends on the medium.
+    pub fn new(settings: GridSettings) -> Self {
+        Self { settings, grids: Vec::new() }
+    }
+
+    fn grid(&mut self, field: &DensityField, step: usize) -> &SweepGrid {
+        let at = self.grids.iter().position(|(s, _)| *s == step).unwrap_or_else(|| {
+            self.grids.push((step, SweepGrid::new(&field.coarsened(step))));
+            self.grids.len() - 1
+        });
+        &self.grids[at].1
+    }
+
+    /// Solves for the source radiance of `field`, the same frame in every call, under `beams`.
+    pub fn solve(
+        &mut self,
+        field: &DensityField,
+        beams: &[Beam],
+        medium: &BandedMedium,
+        scattering: ScatteringOrder,
+    ) -> GridSource {
+        let settings = self.settings;
+        let bands = (1..=MAX_ORDER).rev().find(|&b| medium.moments[b - 1].abs() > 1e-6).unwrap_or(1);
+        let step = if settings.single_step == 0 { single_step(field) } else { settings.single_step };
+        let single = single_layer(self.grid(field, step), step, beams, medium, bands);
+        let scatters = medium.albedo.iter().any(|&a| a > 0.0) && medium.sigma_t.iter().any(|&s| s > 0.0);
+        if scattering == ScatteringOrder::Single || !scatters || beams.is_empty() {
+            return GridSource { single, multiple: None, iterations: 0, residual: 0.0 };
+        }
+        let thickest = medium.sigma_t.iter().copied().fold(0.0, f32::max);
+        let step = if settings.multiple_step == 0 { multiple_step(field, thickest) } else { settings.multiple_step };
+        let bands = bands.min(settings.multiple_order.max(1));
+        let grid = self.grid(field, step);
+        let first = single_layer(grid, step, beams, medium, bands);
+        let (multiple, iterations, residual) = multiple_layer(grid, first, medium, bands, &settings);
+        GridSource { single, multiple: Some(multiple), iterations, residual }
+    }
+}
+
+fn single_layer(grid: &SweepGrid, step: usize, beams: &[Beam], medium: &BandedMedium, bands: usize) -> Layer {
     let weighted: Vec<WeightedBeam> = beams
         .iter()
         .map(|beam| {
@@ -134,18 +155,17 @@ fn single_layer(field: &DensityField, step: usize, beams: &[Beam], medium: &Band
             WeightedBeam { beam: *beam, weights: (0..bands * bands).map(weight).collect() }
         })
         .collect();
-    Layer { step, dims: grid.dims, planes: single_scattering(&grid, &weighted, medium.sigma_t) }
+    Layer { step, dims: grid.dims, planes: single_scattering(grid, &weighted, medium.sigma_t) }
 }
 
 /// From single scattering on the coarse nodes to what is scattered more than once.
 fn multiple_layer(
-    field: &DensityField,
+    grid: &SweepGrid,
     first: Layer,
     medium: &BandedMedium,
     bands: usize,
     settings: &GridSettings,
 ) -> (Layer, usize, f64) {
-    let grid = SweepGrid::new(&field.coarsened(first.step));
     let directions = Directions::product(settings.rings, 2 * settings.rings);
     let ordinates: Vec<Ordinate> = (0..directions.len())
         .map(|q| {
@@ -155,20 +175,20 @@ fn multiple_layer(
         })
         .collect();
     let n = grid.len();
-    let apply = |x: &[f32]| -> Vec<f32> {
+    // (1 - F K) x, all planes one after the other.
+    let product = |x: &[f32], out: &mut [f32]| {
         let source: Vec<Vec<f32>> = x.chunks(n).map(<[f32]>::to_vec).collect();
-        let mut gathered = gather(&grid, &ordinates, medium.sigma_t, &source);
-        gathered.par_iter_mut().enumerate().for_each(|(plane, values)| {
+        let gathered = gather(grid, &ordinates, medium.sigma_t, &source);
+        out.par_chunks_mut(n).zip(x.par_chunks(n)).enumerate().for_each(|(plane, (out, x))| {
             let gain = medium.albedo[plane % 3] * medium.moments[BAND[plane / 3]];
-            values.iter_mut().for_each(|v| *v *= gain);
+            out.iter_mut().zip(x).zip(&gathered[plane]).for_each(|((o, x), g)| *o = x - gain * g);
         });
-        gathered.concat()
     };
     let b = first.planes.concat();
-    let solution = krylov::solve(apply, &b, None, settings.tolerance, settings.iterations);
-    let planes =
-        solution.x.chunks(n).zip(&first.planes).map(|(all, one)| all.iter().zip(one).map(|(a, o)| a - o).collect());
-    (Layer { planes: planes.collect(), ..first }, solution.iterations, solution.residual)
+    let mut x = b.clone();
+    let solved = gmres::solve(product, &b, &mut x, settings.tolerance, settings.iterations);
+    let planes = x.chunks(n).zip(&first.planes).map(|(all, one)| all.iter().zip(one).map(|(a, o)| a - o).collect());
+    (Layer { planes: planes.collect(), ..first }, solved.iterations, solved.residual)
 }
 
 impl SourceRadiance for GridSource {
@@ -256,8 +276,8 @@ mod tests {
     use super::*;
     use crate::camera::Camera;
     use crate::film::Film;
-    use crate::light::Environment;
-    use crate::march::{MarchSettings, march};
+    use crate::light::{Environment, Light, beams};
+    use crate::march::{Black, MarchMedium, MarchSettings, march};
     use crate::transport::medium::MediumParameters;
     use glam::{DAffine3, Vec3};
 
@@ -272,12 +292,28 @@ mod tests {
         DensityField::from_box([0; 3], [n; 3], &values, DAffine3::from_scale(DVec3::splat(1.0 / 14.0)))
     }
 
+    fn solve(
+        field: &DensityField,
+        lights: &[Light],
+        medium: &BandedMedium,
+        scattering: ScatteringOrder,
+        settings: &GridSettings,
+    ) -> GridSource {
+        GridTransport::new(*settings).solve(field, &beams(lights, settings.beams), medium, scattering)
+    }
+
     fn image(field: &DensityField, lights: &[Light], medium: &MediumParameters, settings: &GridSettings) -> Film {
         let banded = medium.banded(4);
         let source = solve(field, lights, &banded, ScatteringOrder::All, settings);
         let centre = field.world_from_node.transform_point3(DVec3::splat(12.5));
         let camera = Camera::look_at(centre - DVec3::new(5.0, 0.3, 0.2), centre, DVec3::Z, 20.0, 24, 24);
-        march(&source.shade(field, camera.position), &camera, banded.sigma_t, &MarchSettings::default())
+        march(
+            &source.shade(field, camera.position),
+            &camera,
+            &MarchMedium::plain(banded.sigma_t),
+            &Black,
+            &MarchSettings::default(),
+        )
     }
 
     fn grey(sigma_t: f32, albedo: f32, g: f32) -> MediumParameters {
@@ -407,7 +443,13 @@ mod tests {
         let view = |source: &GridSource, x: f64| {
             let target = field.world_from_node.transform_point3(DVec3::splat(12.5));
             let camera = Camera::look_at(eye(x), target, DVec3::Z, 20.0, 16, 16);
-            march(&source.shade(&field, camera.position), &camera, [4.0; 3], &MarchSettings::default())
+            march(
+                &source.shade(&field, camera.position),
+                &camera,
+                &MarchMedium::plain([4.0; 3]),
+                &Black,
+                &MarchSettings::default(),
+            )
         };
         let (a, b) = (view(&a, 2.0), view(&b, -2.0));
         for y in 0..16 {

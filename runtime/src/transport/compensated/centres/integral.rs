@@ -21,10 +21,10 @@ use rayon::prelude::*;
 use crate::medium::gaussian_points::GaussianPoints;
 use crate::sphere::harmonics::{BAND, MAX_ORDER, evaluate};
 use crate::sphere::quadrature::Directions;
-use crate::transport::compensated::decay::decay;
-use crate::transport::compensated::depth::DirectionalDepth;
+use crate::transport::compensated::centres::decay::decay;
+use crate::transport::compensated::centres::depth::DirectionalDepth;
+use crate::transport::compensated::centres::overlap::OverlapGrid;
 use crate::transport::compensated::gmres::{Solved, solve};
-use crate::transport::compensated::overlap::OverlapGrid;
 
 /// Steps along a ray, from the centre to where the ray leaves all Gaussians.
 const STEPS: usize = 64;
@@ -222,7 +222,7 @@ fn weighted(row: &[f32], v: &[f64]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::transport::compensated::testing::{Pcg, cloud, points};
+    use crate::transport::compensated::centres::testing::{Pcg, cloud, points};
     use smoke_formats::gaussian::Gaussian;
 
     const ROOT: f32 = 3.544_907_7;
@@ -249,9 +249,9 @@ mod tests {
         fn single(&self, scale: f64, albedo: f32, g: f32) -> Vec<[f32; 3]> {
             let medium =
                 crate::transport::medium::MediumParameters { sigma_t: [1.0; 3], albedo: [albedo; 3], g }.banded(2);
-            let basis = crate::transport::compensated::centres::Basis::new(2, &self.directions);
+            let basis = crate::transport::compensated::centres::single::Basis::new(2, &self.directions);
             let light = [(); 3].map(|()| vec![1.0; self.directions.padded()]);
-            crate::transport::compensated::centres::scatter_directions(
+            crate::transport::compensated::centres::single::scatter_directions(
                 &self.depth,
                 self.set.len(),
                 [scale; 3],

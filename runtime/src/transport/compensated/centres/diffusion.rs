@@ -307,7 +307,7 @@ fn derivatives(at: [f64; 3], center: [f64; 3], inverse_square: f64) -> ([f64; 3]
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::transport::compensated::testing::{Pcg, cloud, points};
+    use crate::transport::compensated::centres::testing::{Pcg, cloud, points};
     use crate::transport::medium::MediumParameters;
 
     const ROOT: f32 = 3.544_907_7;

@@ -20,8 +20,8 @@ use rayon::prelude::*;
 use crate::medium::gaussian_points::{GaussianPoints, LANES};
 use crate::sphere::harmonics::{BAND, MAX_COEFFICIENTS, MAX_ORDER, ZONAL_SCALE, evaluate_lanes};
 use crate::sphere::quadrature::Directions;
-use crate::transport::compensated::decay::{decay, erfcx};
-use crate::transport::compensated::zonal::ZonalTable;
+use crate::transport::compensated::centres::decay::{decay, erfcx};
+use crate::transport::compensated::centres::zonal::ZonalTable;
 
 /// Receivers of one task: fixed, so that the work is cut alike at any number of threads.
 const CHUNK: usize = 8;
@@ -136,8 +136,8 @@ fn directions_at(points: &GaussianPoints, at: [f32; 3], directions: &Directions,
 mod tests {
     use super::*;
     use crate::sphere::harmonics::evaluate;
-    use crate::transport::compensated::testing::{cloud, points};
-    use crate::transport::compensated::zonal::ray_depth;
+    use crate::transport::compensated::centres::testing::{cloud, points};
+    use crate::transport::compensated::centres::zonal::ray_depth;
 
     fn truth(points: &GaussianPoints, i: usize, w: glam::Vec3) -> f64 {
         let w = w.as_dvec3().normalize();

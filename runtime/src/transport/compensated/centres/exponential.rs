@@ -20,8 +20,8 @@ use std::sync::LazyLock;
 use crate::sphere::harmonics::{MAX_ORDER, limit_to_positive};
 use crate::sphere::quadrature::gauss_legendre;
 use crate::sphere::triple::add_product;
-use crate::transport::compensated::decay::decay;
-use crate::transport::compensated::zonal::zonal_depth;
+use crate::transport::compensated::centres::decay::decay;
+use crate::transport::compensated::centres::zonal::zonal_depth;
 
 /// How depth becomes transmittance at the centres.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

@@ -6,14 +6,14 @@
 use crate::medium::gaussian_points::{GaussianError, GaussianPoints};
 use crate::sphere::harmonics::{MAX_COEFFICIENTS, MAX_ORDER, limit_to_positive};
 use crate::sphere::quadrature::Directions;
-use crate::transport::compensated::centres::{
+use crate::transport::compensated::centres::depth::{DirectionalDepth, harmonic_depth};
+use crate::transport::compensated::centres::diffusion::{Channel, Diffusion};
+use crate::transport::compensated::centres::exponential::Exponential;
+use crate::transport::compensated::centres::integral::IntegralTransport;
+use crate::transport::compensated::centres::overlap::OverlapGrid;
+use crate::transport::compensated::centres::single::{
     Basis, CentreRadiance, IncidentRadiance, evaluate_depth, gains, scatter_directions, scatter_harmonics,
 };
-use crate::transport::compensated::depth::{DirectionalDepth, harmonic_depth};
-use crate::transport::compensated::diffusion::{Channel, Diffusion};
-use crate::transport::compensated::exponential::Exponential;
-use crate::transport::compensated::integral::IntegralTransport;
-use crate::transport::compensated::overlap::OverlapGrid;
 use crate::transport::medium::{MediumError, MediumParameters};
 use smoke_formats::gaussian::Gaussian;
 
@@ -128,6 +128,11 @@ impl CentreTransport {
         &self.directions
     }
 
+    /// Rings of these directions; each has twice as many.
+    pub fn rings(&self) -> usize {
+        self.settings.rings
+    }
+
     /// The checked Gaussians.
     pub fn points(&self) -> &GaussianPoints {
         &self.points
@@ -151,7 +156,10 @@ impl CentreTransport {
         }
         self.check_light(light)?;
         let (order, n) = (self.settings.order, self.points.len());
-        let banded = medium.banded(order);
+        let banded = match self.settings.multiple {
+            MultipleScattering::None => medium.windowed(order),
+            _ => medium.banded(order),
+        };
         // Above 1e30 everything is opaque at any depth that f32 can tell from 0, and products stay finite.
         let scale =
             banded.sigma_t.map(|s| (f64::from(s) * f64::from(unit_length_world) * self.points.density_scale).min(1e30));
@@ -230,7 +238,7 @@ impl CentreTransport {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::transport::compensated::testing::cloud;
+    use crate::transport::compensated::centres::testing::cloud;
 
     const ROOT: f32 = 3.544_907_7;
     const EXPONENTIALS: [Exponential; 4] =

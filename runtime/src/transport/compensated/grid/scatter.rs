@@ -250,7 +250,7 @@ mod tests {
     use crate::medium::field::DensityField;
     use crate::sphere::harmonics::evaluate;
     use crate::sphere::quadrature::Directions;
-    use crate::transport::compensated::single::{WeightedBeam, single_scattering};
+    use crate::transport::compensated::grid::single::{WeightedBeam, single_scattering};
     use glam::DAffine3;
 
     fn lumps() -> DensityField {

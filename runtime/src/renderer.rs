@@ -1,0 +1,241 @@
+//! Frame, lights, medium and camera in, image and seconds out.
+//!
+//! Everything that was computed is kept with what it was computed from, and an edit drops only what depends on it: a new
+//! camera marches again (and shades again if the phase function is not isotropic), new lights or a new medium solve again
+//! on the same grids or depths. Nothing of an earlier result goes into a later one, so a frame is the same to the bit
+//! alone, in a sequence, and after any edits that end in the same place.
+
+use crate::backdrop::Sky;
+use crate::camera::Camera;
+use crate::film::Film;
+use crate::light::{Beam, Light, beams};
+use crate::march::{MarchMedium, MarchSettings, ShadedVolume, march};
+use crate::medium::frame::Frame;
+use crate::transport::compensated::centres::incident::incident;
+use crate::transport::compensated::centres::route::{CentreError, CentreSettings, CentreTransport, MultipleScattering};
+use crate::transport::compensated::centres::source::{CentreSource, UnitPlacement};
+use crate::transport::compensated::grid::route::{GridSettings, GridTransport};
+use crate::transport::medium::{MediumError, MediumParameters};
+use crate::transport::{ScatteringOrder, SourceRadiance};
+use glam::DVec3;
+use std::time::Instant;
+
+/// Where the source radiance is solved.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Route {
+    /// On grid nodes: the default.
+    Grid(GridSettings),
+    /// At the Gaussians' centres, as the paper does. The order is that of [`RenderSettings`], and single scattering
+    /// alone has no multiple scattering, whatever these settings say.
+    Centres(CentreSettings),
+}
+
+/// The dials of an image.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RenderSettings {
+    /// Where the source radiance is solved.
+    pub route: Route,
+    /// Bands of the spherical harmonics of the phase function and the source radiance, 1 to 6.
+    pub sh_order: usize,
+    /// Orders of scattering.
+    pub scattering: ScatteringOrder,
+    /// The march.
+    pub march: MarchSettings,
+}
+
+impl Default for RenderSettings {
+    fn default() -> Self {
+        Self {
+            route: Route::Grid(GridSettings::default()),
+            sh_order: 4,
+            scattering: ScatteringOrder::All,
+            march: MarchSettings::default(),
+        }
+    }
+}
+
+/// Why an image cannot be made.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum RenderError {
+    /// A medium parameter out of range.
+    #[error(transparent)]
+    Medium(#[from] MediumError),
+    /// The centres' route refuses its input.
+    #[error(transparent)]
+    Centres(#[from] CentreError),
+    /// The centres' route needs Gaussians that are round in the world.
+    #[error(
+        "the map from voxels to the world stretches or shears, expected a uniform scale for the route through centres; use the grid route"
+    )]
+    NotUniform,
+    /// The centres' route needs Gaussians.
+    #[error(
+        "the frame has density but no Gaussians, expected at least 1 for the route through centres; use the grid route"
+    )]
+    NoGaussians,
+    /// A setting out of range.
+    #[error("{name}: found {found}, expected {expected}")]
+    Setting {
+        /// Which one.
+        name: &'static str,
+        /// Its value.
+        found: String,
+        /// The legal values.
+        expected: &'static str,
+    },
+}
+
+/// Wall seconds of the stages of one image; zero for what was still valid.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Seconds {
+    /// Density and lights to source radiance.
+    pub source_radiance: f64,
+    /// Source radiance to the nodes, for the eye.
+    pub volume_pass: f64,
+    /// The march.
+    pub view_pass: f64,
+}
+
+/// The frame with what depends on it alone.
+struct Loaded {
+    frame: Frame,
+    transport: Transport,
+}
+
+enum Transport {
+    Grid(GridTransport),
+    Centres(Box<CentreTransport>, UnitPlacement),
+}
+
+/// See the module's head.
+pub struct Renderer {
+    settings: RenderSettings,
+    medium: MediumParameters,
+    lights: Vec<Light>,
+    /// The lights as beams, for the grid route.
+    beams: Option<Vec<Beam>>,
+    sky: Option<Sky>,
+    loaded: Option<Loaded>,
+    source: Option<(Box<dyn SourceRadiance>, MarchMedium)>,
+    shaded: Option<(ShadedVolume, DVec3)>,
+}
+
+impl Renderer {
+    /// Checks settings and medium. There is nothing to see before [`Self::set_frame`].
+    pub fn new(settings: RenderSettings, medium: MediumParameters, lights: Vec<Light>) -> Result<Self, RenderError> {
+        medium.check()?;
+        check(&settings)?;
+        let (beams, sky, loaded, source, shaded) = (None, None, None, None, None);
+        Ok(Self { settings, medium, lights, beams, sky, loaded, source, shaded })
+    }
+
+    /// Another frame.
+    pub fn set_frame(&mut self, frame: Frame) -> Result<(), RenderError> {
+        (self.source, self.shaded, self.loaded) = (None, None, None);
+        let transport = match self.settings.route {
+            Route::Grid(settings) => Transport::Grid(GridTransport::new(settings)),
+            Route::Centres(settings) => {
+                let placement = UnitPlacement::of(&frame).ok_or(RenderError::NotUniform)?;
+                if frame.gaussians.is_empty() && frame.field.max() > 0.0 {
+                    return Err(RenderError::NoGaussians);
+                }
+                let multiple = match self.settings.scattering {
+                    ScatteringOrder::Single => MultipleScattering::None,
+                    ScatteringOrder::All => settings.multiple,
+                };
+                let settings = CentreSettings { order: self.settings.sh_order, multiple, ..settings };
+                Transport::Centres(Box::new(CentreTransport::new(&frame.gaussians, settings)?), placement)
+            }
+        };
+        self.loaded = Some(Loaded { frame, transport });
+        Ok(())
+    }
+
+    /// Other lights.
+    pub fn set_lights(&mut self, lights: Vec<Light>) {
+        self.lights = lights;
+        (self.beams, self.sky, self.source, self.shaded) = (None, None, None, None);
+    }
+
+    /// Another medium.
+    pub fn set_medium(&mut self, medium: MediumParameters) -> Result<(), RenderError> {
+        medium.check()?;
+        self.medium = medium;
+        (self.sky, self.source, self.shaded) = (None, None, None);
+        Ok(())
+    }
+
+    /// The image from `camera`, and the seconds it took; an image of empty pixels before any frame.
+    pub fn render(&mut self, camera: &Camera) -> Result<(Film, Seconds), RenderError> {
+        let mut seconds = Seconds::default();
+        let Some(loaded) = &mut self.loaded else { return Ok((Film::new(camera.width, camera.height), seconds)) };
+        let start = Instant::now();
+        let (source, medium) = match &self.source {
+            Some(source) => source,
+            None => {
+                let beams = match self.settings.route {
+                    Route::Grid(grid) => self.beams.get_or_insert_with(|| beams(&self.lights, grid.beams)).as_slice(),
+                    Route::Centres(_) => &[],
+                };
+                self.source.insert(solve(loaded, &self.settings, &self.medium, &self.lights, beams)?)
+            }
+        };
+        seconds.source_radiance = start.elapsed().as_secs_f64();
+        let start = Instant::now();
+        let still_good = |eye: DVec3| eye == camera.position || !source.depends_on_view();
+        let shaded = match self.shaded.take() {
+            Some((volume, eye)) if still_good(eye) => (volume, eye),
+            _ => (source.shade(&loaded.frame.field, camera.position), camera.position),
+        };
+        let shaded = &self.shaded.insert(shaded).0;
+        seconds.volume_pass = start.elapsed().as_secs_f64();
+        let start = Instant::now();
+        let peak = (medium.peak_ratio != [1.0; 3]).then_some((self.medium.g, self.settings.sh_order));
+        let sky = self.sky.get_or_insert_with(|| Sky::new(&self.lights, peak));
+        let film = march(shaded, camera, medium, sky, &self.settings.march);
+        seconds.view_pass = start.elapsed().as_secs_f64();
+        Ok((film, seconds))
+    }
+}
+
+fn solve(
+    loaded: &mut Loaded,
+    settings: &RenderSettings,
+    medium: &MediumParameters,
+    lights: &[Light],
+    beams: &[Beam],
+) -> Result<(Box<dyn SourceRadiance>, MarchMedium), RenderError> {
+    let Loaded { frame, transport } = loaded;
+    Ok(match transport {
+        Transport::Grid(transport) => {
+            let banded = match settings.scattering {
+                ScatteringOrder::Single => medium.windowed(settings.sh_order),
+                ScatteringOrder::All => medium.banded(settings.sh_order),
+            };
+            let source = transport.solve(&frame.field, beams, &banded, settings.scattering);
+            (Box::new(source), MarchMedium::of(medium.sigma_t, banded.sigma_t))
+        }
+        Transport::Centres(transport, placement) => {
+            let light = incident(lights, transport.directions(), transport.rings(), placement.rotation);
+            let radiance = transport.radiance(medium, placement.length_world as f32, &light, None)?;
+            let marched = MarchMedium::of(medium.sigma_t, radiance.sigma_t);
+            (Box::new(CentreSource::new(transport.points().clone(), radiance, frame, *placement)), marched)
+        }
+    })
+}
+
+fn check(settings: &RenderSettings) -> Result<(), RenderError> {
+    let setting = |good: bool, name, found: String, expected| match good {
+        true => Ok(()),
+        false => Err(RenderError::Setting { name, found, expected }),
+    };
+    let march = settings.march;
+    setting((1..=6).contains(&settings.sh_order), "SH order", settings.sh_order.to_string(), "1 to 6")?;
+    setting(march.step > 0.0 && march.step <= 4.0, "march step", march.step.to_string(), "voxels above 0, up to 4")?;
+    setting((0.0..1.0).contains(&march.cutoff), "cutoff", march.cutoff.to_string(), "0 to below 1")?;
+    setting((1..=64).contains(&march.samples), "samples", march.samples.to_string(), "1 to 64")?;
+    if let Route::Grid(grid) = settings.route {
+        setting((1..=65536).contains(&grid.beams), "beams", grid.beams.to_string(), "1 to 65536")?;
+    }
+    Ok(())
+}

@@ -1,0 +1,6 @@
+//! The grid route: source radiance on nodes, by sweeps along sheared columns ([`route`]).
+
+pub mod columns;
+pub mod route;
+pub mod scatter;
+pub mod single;

@@ -1,0 +1,40 @@
+//! A small pack for unit tests of the subcommands around it.
+
+use smoke_formats::gaussian::Gaussian;
+use smoke_formats::pack::{AtRest, FrameData, FrameRecord, Promise, SequenceRecord, SettingsRecord, write};
+use smoke_formats::residual::ResidualCodes;
+use smoke_formats::volume::VoxelMask;
+use std::path::Path;
+
+/// Writes a pack of the given frames, 4 x 3 x 2 voxels of 0.5 world units at index (10, -2, 0), every other voxel in the
+/// support, three Gaussians a frame, codes that differ from frame to frame.
+pub fn small_pack(path: &Path, frames: &[i32], step: f32) {
+    let (origin, dims) = ([10, -2, 0], [4, 3, 2]);
+    let gaussian = |i: usize| Gaussian { center: [0.3 * i as f32, 0.2, 0.1], radius: 0.4, weight: 0.25 };
+    let gaussians: Vec<Gaussian> = (0..3).map(gaussian).collect();
+    let mut support = VoxelMask::new(24);
+    (0..24).step_by(2).for_each(|v| support.set(v));
+    let sequence = SequenceRecord {
+        world_from_index: [0.5, 0.0, 0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 0.5, 1.0, 2.0, 3.0],
+        origin,
+        dims,
+        density_max: 1.0,
+        promise: Promise::MaxError(0.5 * f64::from(step)),
+        frames_per_second: Some(24.0),
+        name: "small".into(),
+        grid: "density".into(),
+    };
+    let settings = SettingsRecord { json: r#"{"gaussians":3}"#.into() };
+    let filled = write(path, |mut writer| {
+        for &frame in frames {
+            let codes = (0..12).map(|i| i * frame % 7).collect();
+            let codes = ResidualCodes { origin, dims, support: support.clone(), codes };
+            let max_error = 0.5 * f64::from(step);
+            let record =
+                FrameRecord { frame, fit_error: 0.02, max_error, psnr_db: 47.5, step, ..FrameRecord::default() };
+            writer.push_rank(&FrameData { record, gaussians: &gaussians, codes: &codes }, AtRest::RAW)?;
+        }
+        writer.finish(&sequence, &settings)
+    });
+    filled.unwrap();
+}
