@@ -1,7 +1,7 @@
 //! The fit of one frame: the first in full, each later one from the one before it.
 //!
 //! First frame: spread Gaussians over the density ([`initial`](super::initial)), minimise, and exchange useless
-//! Gaussians for needed ones every few iterations ([`teleport`](super::teleport)). Later frames (Zhou et al. 2008,
+//! Gaussians for needed ones every few iterations ([`teleport`]). Later frames (Zhou et al. 2008,
 //! section 5.1): start from the frame before, delete the 3 of least integral, minimise; while the error is more than
 //! `error_ratio` times that of the first frame, insert Gaussians where density is missing and minimise again, at most
 //! 8 in all. Where we deviate: insertions go by expected gain, half of what is left of the 8 at a time, which takes

@@ -6,7 +6,7 @@
 //! [`Rule::Batch`], the default, decides by the objective itself. Taking a Gaussian away costs about `w^2 sum B^2`;
 //! one more at c with radius r gains `(sum e B)^2 / sum B^2` at its best weight (the greedy step of matching pursuit,
 //! Mallat, Zhang 1993). Candidate places are the centroids of missing density in a grid of cells; pairs of the largest
-//! gains and the least losses are exchanged, several at once, as long as the gain is [`MARGIN`] times the loss.
+//! gains and the least losses are exchanged, several at once, as long as the gain is at least the loss.
 //! The optimiser keeps its memory, less the entries of the variables moved. A move that does not lower the cost
 //! is undone. Cost: a forward pass, three moments a candidate, and one evaluation.
 
