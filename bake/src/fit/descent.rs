@@ -282,8 +282,9 @@ mod tests {
     #[test]
     fn a_gaussian_that_does_not_help_is_not_inserted() {
         let (objective, x) = ball();
-        let mut descent = Descent::new(&objective, x.clone(), BOUNDS, 10, 0.0, 10).unwrap();
+        let mut descent = Descent::new(&objective, x, BOUNDS, 10, 0.0, 10).unwrap();
+        let (x, cost) = (descent.x.clone(), descent.cost);
         assert!(!descent.try_insert(&[[0.05, 0.05, 0.05, 0.1, 0.9]]));
-        assert_eq!(descent.x, x);
+        assert_eq!((descent.x, descent.cost), (x, cost));
     }
 }
