@@ -4,7 +4,7 @@
 //! already written: an interrupted one goes on from its work folder and ends with the same bytes.
 //! Memory: one frame, and the codes of one tile of 27 frames where a hash is to be tried.
 
-use crate::fit::frame::{Fit, FitProgress, FitSettings, fit_first, fit_next};
+use crate::fit::frame::{Fit, FitProgress, FitSettings, fit_first, fit_next, reference_error};
 use crate::residual::quantise::{Target, quantise};
 use crate::residual::tile::{ResidualMode, choose};
 use crate::survey::{Survey, SurveyedFrame, hash_file, read_density};
@@ -141,8 +141,9 @@ pub fn bake(
                 encoded
             }
         };
-        let first_error = before.as_ref().map_or(encoded.record().fit_error, |b| b.first_error);
-        before = Some(Before { gaussians: encoded.decode_gaussians(output)?, first_error, encoded });
+        let least = before.as_ref().map_or(f64::INFINITY, |b| b.reference);
+        let reference = reference_error(least, encoded.record().fit_error);
+        before = Some(Before { gaussians: encoded.decode_gaussians(output)?, reference, encoded });
     }
     let sequence = SequenceRecord {
         world_from_index: survey.world_from_index.to_cols_array(),
@@ -161,7 +162,8 @@ pub fn bake(
 /// What a later frame needs of the ones before it.
 struct Before {
     gaussians: Vec<Gaussian>,
-    first_error: f64,
+    /// The error that the rule for insertions compares with.
+    reference: f64,
     encoded: EncodedFrame,
 }
 
@@ -188,7 +190,7 @@ fn bake_frame(
     let mut progress = |progress| observe(Event::Fit { frame: frame.number, progress });
     let fit = match before {
         None => fit_first(&density, space, &settings.fit, &mut progress),
-        Some(b) => fit_next(&density, space, &b.gaussians, b.first_error, &settings.fit, &mut progress),
+        Some(b) => fit_next(&density, space, &b.gaussians, b.reference, &settings.fit, &mut progress),
     };
     let Fit { gaussians, .. } = fit.map_err(|source| Error::Fit { path: frame.path.clone(), source })?;
     seconds.fit = clock.lap();
