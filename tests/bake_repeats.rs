@@ -6,7 +6,7 @@ mod common;
 use common::{Random, answer, command};
 use std::path::Path;
 use std::process::Stdio;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 /// A bake of the first frames, small enough to be repeated often.
 fn line<'a>(output: &'a str, more: &[&'a str]) -> Vec<&'a str> {
@@ -54,12 +54,13 @@ fn a_bake_killed_at_any_moment_and_resumed_ends_with_the_same_bytes() {
     let folder = tempfile::tempdir().unwrap();
     let start = Instant::now();
     answer(folder.path(), &line("whole.smoke", &[]));
-    let whole = start.elapsed();
+    let mut whole = start.elapsed();
     let expected = bytes(folder.path(), "whole.smoke");
 
     let (mut killed, mut kept_work) = (0, 0);
-    for round in 0..40 {
+    for round in 0..200 {
         let name = format!("killed{round}.smoke");
+        let start = Instant::now();
         let mut child = command(folder.path(), &line(&name, &[]));
         let mut child = child.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
         std::thread::sleep(whole.mul_f64(random.below(1000) as f64 / 1000.0));
@@ -69,6 +70,8 @@ fn a_bake_killed_at_any_moment_and_resumed_ends_with_the_same_bytes() {
         let pack = folder.path().join(&name);
         if status.code() == Some(0) {
             assert!(bytes(folder.path(), &name) == expected, "round {round}");
+            // It was done before the kill: the machine is faster now than it was.
+            whole = whole.min(start.elapsed());
             continue;
         }
         killed += 1;
@@ -84,10 +87,7 @@ fn a_bake_killed_at_any_moment_and_resumed_ends_with_the_same_bytes() {
             break;
         }
     }
-    println!(
-        "{killed} kills, {kept_work} with work kept, {:?} a bake",
-        Duration::from_millis(whole.as_millis() as u64)
-    );
-    assert!(killed >= 20, "only {killed} of 40 bakes were caught alive");
+    println!("{killed} kills, {kept_work} with work kept, {whole:?} a bake");
+    assert!(killed >= 20, "only {killed} of 200 bakes were caught alive");
     assert!(kept_work > 0, "no kill came after work had been kept: the test resumed nothing");
 }
