@@ -167,7 +167,8 @@ pub fn codec_of(path: &Path, what: &str, section: &SectionRecord) -> Result<Code
     let allowed: &[Codec] = match section.kind {
         KIND_SEQUENCE | KIND_SETTINGS | KIND_FRAMES => &[Codec::Raw],
         KIND_GAUSSIANS => &[Codec::Raw, Codec::Deflate, Codec::Snapped],
-        KIND_RANK | KIND_HASH => &[Codec::Raw, Codec::Coded, Codec::Deflate],
+        KIND_RANK => &[Codec::Raw, Codec::Coded, Codec::Deflate, Codec::CodedAfter],
+        KIND_HASH => &[Codec::Raw, Codec::Coded, Codec::Deflate],
         _ => return Err(Error::invalid(path, format!("{what}.kind"), section.kind, "1 to 6")),
     };
     allowed.iter().copied().find(|&c| c as u32 == section.codec).ok_or_else(|| {

@@ -30,8 +30,13 @@ pub struct EncodedFrame {
 }
 
 impl EncodedFrame {
-    /// Encodes a frame; `path` is the pack that errors name.
-    pub fn new(path: &Path, frame: &FrameData, at_rest: AtRest) -> Result<Self> {
+    /// Encodes a frame; `path` is the pack that errors name. With `previous`, a coded residual is coded after that
+    /// frame's, which must be the one before in the pack.
+    pub fn new(path: &Path, frame: &FrameData, at_rest: AtRest, previous: Option<&ResidualCodes>) -> Result<Self> {
+        let at_rest = match (at_rest.residual, previous) {
+            (Codec::Coded, Some(_)) => AtRest { residual: Codec::CodedAfter, ..at_rest },
+            _ => at_rest,
+        };
         frame.codes.check(path)?;
         gaussians::check(path, &format!("frame {}", frame.record.frame), frame.gaussians)?;
         let plain: Vec<u8> = frame.gaussians.iter().flat_map(gaussians::to_bytes).collect();
@@ -40,10 +45,12 @@ impl EncodedFrame {
             Codec::Raw => plain,
             Codec::Deflate => deflate(&plain),
             Codec::Snapped => gaussians::encode(path, frame.gaussians)?,
-            Codec::Coded => return Err(Error::invalid(path, "gaussians.codec", "Coded", "Raw, Deflate, Snapped")),
+            Codec::Coded | Codec::CodedAfter => {
+                return Err(Error::invalid(path, "gaussians.codec", "Coded", "Raw, Deflate, Snapped"));
+            }
         };
         let ranks = rank::encode(frame.codes);
-        let residual = encode_rank(frame.codes, &ranks, at_rest.residual);
+        let residual = encode_rank(frame.codes, &ranks, at_rest.residual, previous);
         let record = FrameRecord {
             origin: frame.codes.origin,
             dims: frame.codes.dims,
@@ -139,7 +146,8 @@ mod tests {
         for at_rest in [AtRest::SMALLEST, AtRest::RAW] {
             let gaussians = super::super::snap_gaussians(path, &gaussians).unwrap();
             let frame =
-                EncodedFrame::new(path, &FrameData { record, gaussians: &gaussians, codes: &codes }, at_rest).unwrap();
+                EncodedFrame::new(path, &FrameData { record, gaussians: &gaussians, codes: &codes }, at_rest, None)
+                    .unwrap();
             let bytes = frame.to_bytes(path).unwrap();
             let back = EncodedFrame::from_bytes(path, &bytes).unwrap();
             assert_eq!(back, frame);

@@ -30,12 +30,16 @@ pub enum Codec {
     Deflate = 2,
     /// Gaussians only: 16 bits a parameter on the frame's own lattice.
     Snapped = 3,
+    /// Rank layout only: coded with the help of the frame before, which must be decoded first.
+    CodedAfter = 4,
 }
 
 impl Codec {
     /// The codec of a number in a file, if it is one.
     pub fn from_number(number: u32) -> Option<Self> {
-        [Self::Raw, Self::Coded, Self::Deflate, Self::Snapped].into_iter().find(|&c| c as u32 == number)
+        [Self::Raw, Self::Coded, Self::Deflate, Self::Snapped, Self::CodedAfter]
+            .into_iter()
+            .find(|&c| c as u32 == number)
     }
 }
 

@@ -74,7 +74,7 @@ impl<W: Write + Seek> PackWriter<W> {
 
     /// The next frame, its residual in the rank layout.
     pub fn push_rank(&mut self, frame: &FrameData, at_rest: AtRest) -> Result<()> {
-        let encoded = EncodedFrame::new(&self.path, frame, at_rest)?;
+        let encoded = EncodedFrame::new(&self.path, frame, at_rest, None)?;
         self.push_encoded(&encoded)
     }
 
@@ -98,7 +98,7 @@ impl<W: Write + Seek> PackWriter<W> {
         let mut records = vec![];
         for (number, frame) in (first..).zip(tile) {
             // Only the Gaussians are taken of it; the residual goes into the tile's own section.
-            let encoded = EncodedFrame::new(&self.path, frame, AtRest { residual: Codec::Raw, ..at_rest })?;
+            let encoded = EncodedFrame::new(&self.path, frame, AtRest { residual: Codec::Raw, ..at_rest }, None)?;
             self.push_gaussians(number, &encoded)?;
             let residual = (encoded.residual.len() as u64, encoded.record.rank_bytes);
             records.push(FrameRecord {
