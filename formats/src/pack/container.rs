@@ -9,7 +9,7 @@
 //! in the header, the sections by theirs in the table, and the bytes between by being zero. Checksums are XXH3-64: they
 //! find damage, not malice, so everything behind them is bounded as well.
 
-use super::records::{Codec, SectionRecord, decode, kind_name};
+use super::records::{Codec, SectionRecord, decode};
 use crate::bounded::Bytes;
 use crate::{Error, Result};
 use std::path::Path;
@@ -126,6 +126,19 @@ impl Header {
         }
         head.finish("header")?;
         Ok(header)
+    }
+}
+
+/// The name of a kind, used as the start of the path in errors.
+pub fn kind_name(kind: u32) -> &'static str {
+    match kind {
+        KIND_SEQUENCE => "sequence",
+        KIND_SETTINGS => "settings",
+        KIND_FRAMES => "frames",
+        KIND_GAUSSIANS => "gaussians",
+        KIND_RANK => "rank",
+        KIND_HASH => "hash",
+        _ => "unknown",
     }
 }
 

@@ -4,10 +4,10 @@
 //! only copies. The bytes of [`EncodedFrame::to_bytes`] are for a bake's own work files, which an interrupted bake
 //! finds again; they carry a checksum and are no part of the pack's format.
 
-use super::at_rest::{decode_gaussians, deflate, encode_rank};
+use super::at_rest::{decode_gaussians, encode_rank};
 use super::gaussians::{self, GAUSSIAN_BYTES};
 use super::records::{self, Codec, FrameRecord, ResidualKind};
-use super::writer::{AtRest, FrameData};
+use super::zlib::deflate;
 use crate::bounded::Bytes;
 use crate::gaussian::Gaussian;
 use crate::residual::ResidualCodes;
@@ -17,6 +17,33 @@ use std::path::Path;
 use xxhash_rust::xxh3::xxh3_64;
 
 const MAGIC: [u8; 8] = *b"SBWORK\x01\n";
+
+/// One frame as it goes into a pack.
+#[derive(Clone, Debug)]
+pub struct FrameData<'a> {
+    /// What is known of it; the fields that [`FrameRecord`] says the writer fills in may hold anything.
+    pub record: FrameRecord,
+    /// Its Gaussians, in the order of the sum; for [`Codec::Snapped`] from [`super::snap_gaussians`].
+    pub gaussians: &'a [Gaussian],
+    /// Its residual.
+    pub codes: &'a ResidualCodes,
+}
+
+/// How sections lie in the file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct AtRest {
+    /// `Raw`, `Deflate` or `Snapped`.
+    pub gaussians: Codec,
+    /// `Raw`, `Deflate` or `Coded`.
+    pub residual: Codec,
+}
+
+impl AtRest {
+    /// The smallest file: Gaussians at 16 bits a parameter, coded residual.
+    pub const SMALLEST: Self = Self { gaussians: Codec::Snapped, residual: Codec::Coded };
+    /// Resident bytes as they are, to be uploaded without decoding.
+    pub const RAW: Self = Self { gaussians: Codec::Raw, residual: Codec::Raw };
+}
 
 /// A frame with its Gaussians and its residual, in the rank layout, as they lie at rest.
 #[derive(Clone, Debug, PartialEq)]

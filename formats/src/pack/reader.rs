@@ -10,11 +10,10 @@
 use super::at_rest::{decode_gaussians, decode_hash, decode_rank};
 use super::container::{
     HEADER_BYTES, Header, KIND_FRAMES, KIND_GAUSSIANS, KIND_HASH, KIND_RANK, KIND_SEQUENCE, KIND_SETTINGS, codec_of,
-    decode_toc,
+    decode_toc, kind_name,
 };
 use super::records::{
     Codec, FrameRecord, MAX_RECORD_BYTES, ResidualKind, SectionRecord, SequenceRecord, SettingsRecord, decode,
-    kind_name,
 };
 use crate::gaussian::Gaussian;
 use crate::residual::{Residual, ResidualCodes};

@@ -3,7 +3,6 @@
 //!
 //! Fields of fixed size come first, so that their offsets can be stated in `FORMAT.md`.
 
-use super::container::{KIND_FRAMES, KIND_SEQUENCE, KIND_SETTINGS};
 use crate::{Error, Result};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
@@ -180,19 +179,6 @@ pub fn decode<T: DeserializeOwned>(path: &Path, what: &str, bytes: &[u8]) -> Res
     match used == bytes.len() {
         true => Ok(record),
         false => Err(Error::invalid(path, what, format!("{} bytes", bytes.len()), format!("{used} bytes"))),
-    }
-}
-
-/// The name of a kind, used as the start of the path in errors.
-pub fn kind_name(kind: u32) -> &'static str {
-    match kind {
-        KIND_SEQUENCE => "sequence",
-        KIND_SETTINGS => "settings",
-        KIND_FRAMES => "frames",
-        super::container::KIND_GAUSSIANS => "gaussians",
-        super::container::KIND_RANK => "rank",
-        super::container::KIND_HASH => "hash",
-        _ => "unknown",
     }
 }
 
