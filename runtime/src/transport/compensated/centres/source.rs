@@ -62,7 +62,7 @@ impl SourceRadiance for CentreSource {
         let eye = self.placement.unit_from_world.transform_point3(eye).as_vec3().to_array();
         let view = ViewDirections::Eye(eye);
         let source = volume_pass(&self.points, &self.radiance, &self.unit, self.first_node, field.dims, view);
-        let nodes = source.iter().zip(&field.values).map(|(&[r, g, b], &d)| [r, g, b, d]).collect();
-        ShadedVolume::new(field.dims, nodes, field.world_from_node)
+        let nodes: Vec<[f32; 4]> = source.iter().zip(&field.values).map(|(&[r, g, b], &d)| [r, g, b, d]).collect();
+        ShadedVolume::new(field.dims, &nodes, field.world_from_node)
     }
 }

@@ -11,6 +11,7 @@
 
 use crate::medium::field::DensityField;
 use glam::{DVec3, Vec3};
+use std::ops::Range;
 
 /// A field in the two layouts that sweeps need: rows must not run along the dominant axis.
 pub struct SweepGrid {
@@ -20,8 +21,14 @@ pub struct SweepGrid {
     natural: Vec<f32>,
     /// Density, y fastest, then z, then x.
     turned: Vec<f32>,
+    /// For both layouts and each row, the nodes within [`REACH`] of density.
+    active: [Vec<Range<usize>>; 2],
     node_from_world: glam::DMat3,
 }
+
+/// Nodes further than this from any density are left out: they emit nothing and are never read with weight. A ray moves
+/// by up to one node a slice and lies between two nodes, so what it needs is within two.
+const REACH: usize = 2;
 
 /// How a slice lies in an array: `start + slice * slice_stride + row * row_stride + column`.
 #[derive(Clone, Copy, Debug)]
@@ -76,8 +83,9 @@ impl SweepGrid {
     /// The two layouts of a field.
     pub fn new(field: &DensityField) -> Self {
         let turned = turn(&field.values, field.dims);
+        let active = active_rows(field);
         let node_from_world = field.world_from_node.matrix3.inverse();
-        Self { dims: field.dims, natural: field.values.clone(), turned, node_from_world }
+        Self { dims: field.dims, natural: field.values.clone(), turned, active, node_from_world }
     }
 
     /// The number of nodes.
@@ -88,6 +96,30 @@ impl SweepGrid {
     /// True for a grid of no nodes, which no field makes.
     pub fn is_empty(&self) -> bool {
         self.natural.is_empty()
+    }
+
+    /// Columns of a row that are near density; empty for a row that is not.
+    #[inline]
+    pub fn active(&self, slices: &Slices, slice: usize, row: usize) -> Range<usize> {
+        self.active[usize::from(slices.turned)][slices.row(slice, row) / slices.columns].clone()
+    }
+
+    /// The same for the row of nodes along x at `j`, `k`.
+    #[inline]
+    pub fn active_x(&self, j: usize, k: usize) -> Range<usize> {
+        self.active[0][j + self.dims[1] * k].clone()
+    }
+
+    /// Rays between the nodes of two neighbouring rows that pass by density: ray c is between columns c and c + 1.
+    #[inline]
+    pub fn active_rays(&self, slices: &Slices, slice: usize, row: usize) -> Range<usize> {
+        let (a, b) = (self.active(slices, slice, row), self.active(slices, slice, row + 1));
+        let both = match (a.is_empty(), b.is_empty()) {
+            (true, _) => b,
+            (_, true) => a,
+            _ => a.start.min(b.start)..a.end.max(b.end),
+        };
+        both.start.saturating_sub(1)..both.end.min(slices.columns - 1)
     }
 
     /// Density in the layout of `slices`.
@@ -181,6 +213,30 @@ pub fn stencil(out: &mut [f32], low: &[f32], high: &[f32], weights: [[f32; 2]; 2
         out[c] =
             weights[0][0] * low0[c] + weights[0][1] * low1[c] + weights[1][0] * high0[c] + weights[1][1] * high1[c];
     }
+}
+
+/// The active columns of every row, in both layouts.
+fn active_rows(field: &DensityField) -> [Vec<Range<usize>>; 2] {
+    let [nx, ny, nz] = field.dims;
+    let mut near: Vec<bool> = field.values.iter().map(|&d| d > 0.0).collect();
+    for (n, stride) in [(nx, 1), (ny, nx), (nz, nx * ny)] {
+        let dense = near.clone();
+        for (v, near) in near.iter_mut().enumerate() {
+            let at = v / stride % n;
+            let (back, on) = (REACH.min(at), REACH.min(n - 1 - at));
+            *near = (0..=back + on).any(|s| dense[v + s * stride - back * stride]);
+        }
+    }
+    let mut rows = [vec![0..0; ny * nz], vec![0..0; nz * nx]];
+    let widen = |row: &mut Range<usize>, at: usize| {
+        *row = if Range::is_empty(row) { at..at + 1 } else { row.start.min(at)..row.end.max(at + 1) };
+    };
+    for v in (0..near.len()).filter(|&v| near[v]) {
+        let (i, j, k) = (v % nx, v / nx % ny, v / nx / ny);
+        widen(&mut rows[0][j + ny * k], i);
+        widen(&mut rows[1][k + nz * i], j);
+    }
+    rows
 }
 
 /// From x fastest to y fastest, then z, then x.

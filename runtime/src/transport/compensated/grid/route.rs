@@ -234,7 +234,7 @@ impl SourceRadiance for GridSource {
                 *node = [sum[0][i].max(0.0), sum[1][i].max(0.0), sum[2][i].max(0.0), density[i]];
             }
         });
-        ShadedVolume::new(field.dims, nodes, field.world_from_node)
+        ShadedVolume::new(field.dims, &nodes, field.world_from_node)
     }
 }
 

@@ -24,7 +24,8 @@ pub struct Ordinate {
     pub harmonics: Vec<f32>,
 }
 
-/// Gathers the radiance that a source radiance sends to every node, projected to spherical harmonics: `K J`.
+/// Gathers the radiance that a source radiance sends to every node near density, projected to spherical harmonics:
+/// `K J`; zero at the others.
 ///
 /// `source` and the result are planes `[coefficient * 3 + channel]` of one value a node, x fastest.
 pub fn gather(grid: &SweepGrid, ordinates: &[Ordinate], sigma_t: [f32; 3], source: &[Vec<f32>]) -> Vec<Vec<f32>> {
@@ -99,8 +100,8 @@ fn sweep(
     for step in 0..slices.count {
         let shift = path.shift(step);
         source_along(slices, shift.slice, &ordinate.harmonics, planes, &mut slice_source);
-        advance(&mut rays, path, &shift, sigma_t, density, &slice_source);
-        deposit(&rays, path, &shift, sigma_t, ordinate, out);
+        advance(grid, &mut rays, path, &shift, sigma_t, density, &slice_source);
+        deposit(grid, &rays, path, &shift, sigma_t, ordinate, out);
     }
 }
 
@@ -137,6 +138,7 @@ const BLOCK: usize = 128;
 /// thin cells and wrong for thick ones, where only the near end is seen.
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn advance(
+    grid: &SweepGrid,
     rays: &mut Rays,
     path: &Path,
     shift: &Shift,
@@ -147,7 +149,6 @@ fn advance(
     let slices = &path.slices;
     let weights = shift.ray_weights();
     let half = 0.5 * path.length;
-    let n = slices.columns - 1;
     let grey = sigma_t[0] == sigma_t[1] && sigma_t[0] == sigma_t[2];
     let (mut met, mut depth, mut source, mut entering) = ([0.0; BLOCK], [0.0; BLOCK], [0.0; BLOCK], [false; BLOCK]);
     let (mut kept, mut near, mut far) = ([0.0; BLOCK], [0.0; BLOCK], [0.0; BLOCK]);
@@ -155,8 +156,9 @@ fn advance(
         let start = (shift.base[1] + row + 1) * path.extent[0] + shift.base[0] + 1;
         let low = &density[slices.row(shift.slice, row)..][..slices.columns];
         let high = &density[slices.row(shift.slice, row + 1)..][..slices.columns];
-        for block in (0..n).step_by(BLOCK) {
-            let len = (n - block).min(BLOCK);
+        let active = grid.active_rays(slices, shift.slice, row);
+        for block in active.clone().step_by(BLOCK) {
+            let len = (active.end - block).min(BLOCK);
             stencil(&mut met[..len], &low[block..], &high[block..], weights);
             let before = &mut rays.density[start + block..][..len];
             let total = &mut rays.depth[start + block..][..len];
@@ -203,18 +205,26 @@ fn advance(
 /// rays around it, times what the interpolated depth lets a constant source send over what the rays' own mean sends:
 /// then a constant source gives one minus the transmittance that single scattering uses, to rounding.
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn deposit(rays: &Rays, path: &Path, shift: &Shift, sigma_t: [f32; 3], ordinate: &Ordinate, out: &mut [Vec<f32>]) {
+fn deposit(
+    grid: &SweepGrid,
+    rays: &Rays,
+    path: &Path,
+    shift: &Shift,
+    sigma_t: [f32; 3],
+    ordinate: &Ordinate,
+    out: &mut [Vec<f32>],
+) {
     let slices = &path.slices;
     let around = shift.node_weights();
-    let n = slices.columns;
     let grey = sigma_t[0] == sigma_t[1] && sigma_t[0] == sigma_t[2];
     let (mut reached, mut factor, mut opacity) = ([0.0; BLOCK], [0.0; BLOCK], [0.0; BLOCK]);
     for row in 0..slices.rows {
         let low = (shift.base[1] + row) * path.extent[0] + shift.base[0];
         let high = low + path.extent[0];
         let target = slices.row(shift.slice, row);
-        for block in (0..n).step_by(BLOCK) {
-            let len = (n - block).min(BLOCK);
+        let active = grid.active(slices, shift.slice, row);
+        for block in active.clone().step_by(BLOCK) {
+            let len = (active.end - block).min(BLOCK);
             let interpolate = |out: &mut [f32; BLOCK], carried: &[f32]| {
                 stencil(&mut out[..len], &carried[low + block..], &carried[high + block..], around);
             };

@@ -5,9 +5,9 @@
 //! in place of that of the Gaussians, and without the detour over spherical harmonics of depth). Transmittance is
 //! exponentiated at each node, so it lies in [0, 1] at any optical depth.
 //! The optical depth is the trapezoidal sum along each ray, which is exact for the trilinear density up to the bilinear
-//! bend inside a cell. Cost: about (25 + 2 coefficients) operations a node and beam.
+//! bend inside a cell. Cost: about (25 + 6 coefficients) operations a node near density and beam, and up to 256 MiB.
 
-use super::columns::{Path, Shift, Slices, SweepGrid, add_turned, stencil};
+use super::columns::{Path, Shift, SweepGrid, stencil};
 use crate::lanes::exp_neg;
 use crate::light::Beam;
 use multiversion::multiversion;
@@ -21,51 +21,114 @@ pub struct WeightedBeam {
     pub weights: Vec<[f32; 3]>,
 }
 
-/// The beams that one task sweeps together: they cross the slices in the same order.
-struct Bundle<'a> {
-    slices: Slices,
-    beams: Vec<(&'a WeightedBeam, Path)>,
-}
+/// Nodes that are summed together.
+const LANES: usize = 16;
+/// Planes that are summed together.
+const GROUP: usize = 6;
+/// Bytes of transmittances that are held at a time.
+const MOST_BYTES: usize = 256 << 20;
 
-/// Source radiance of all beams: planes `[coefficient * 3 + channel]` of one value a node, x fastest.
+/// Source radiance of all beams at the nodes near density, zero at the others: planes `[coefficient * 3 + channel]` of one
+/// value a node, x fastest.
 ///
-/// `sigma_t` is extinction per unit density and world length, per channel. The sum over beams is taken in an order that
-/// depends on the beams alone, so the result does not depend on the number of threads.
+/// `sigma_t` is extinction per unit density and world length, per channel. Beams are summed in their order, so the result
+/// does not depend on the number of threads. Beams run in parallel; then nodes do, so that the sums of a few nodes stay in
+/// registers while all beams pass by, instead of all planes passing by for each beam.
 pub fn single_scattering(grid: &SweepGrid, beams: &[WeightedBeam], sigma_t: [f32; 3]) -> Vec<Vec<f32>> {
-    let planes = beams.first().map_or(3, |b| b.weights.len() * 3);
-    let parts: Vec<(bool, Vec<Vec<f32>>)> = bundles(grid, beams)
-        .into_par_iter()
-        .map(|bundle| {
-            let mut out = vec![vec![0.0; grid.len()]; planes];
-            sweep(grid, &bundle, sigma_t, &mut out);
-            (bundle.slices.turned, out)
-        })
-        .collect();
-    let mut total = vec![vec![0.0; grid.len()]; planes];
-    total.par_iter_mut().enumerate().for_each(|(plane, sum)| {
-        for (turned, part) in &parts {
-            if *turned {
-                add_turned(sum, &part[plane], grid.dims);
-            } else {
-                sum.iter_mut().zip(&part[plane]).for_each(|(s, p)| *s += p);
-            }
+    let [nx, ny, nz] = grid.dims;
+    let coefficients = beams.first().map_or(1, |b| b.weights.len());
+    let mut planes = vec![vec![0.0; grid.len()]; coefficients * 3];
+    let grey = sigma_t[0] == sigma_t[1] && sigma_t[0] == sigma_t[2];
+    let extinctions = if grey { &sigma_t[..1] } else { &sigma_t[..] };
+    // Rows of transmittances are padded to whole blocks.
+    let pitch = nx.next_multiple_of(LANES);
+    let field = pitch * ny * nz;
+    let most = (MOST_BYTES / (4 * field * extinctions.len())).clamp(8, beams.len().max(8));
+    let mut held = vec![vec![0.0; field * extinctions.len()]; most.min(beams.len())];
+    for beams in beams.chunks(most) {
+        held.par_iter_mut().zip(beams).for_each_init(
+            || vec![0.0; grid.len()],
+            |turned, (out, beam)| {
+                let path = grid.path(beam.beam.toward);
+                let fields: Vec<&mut [f32]> = out.chunks_mut(field).collect();
+                transmittances(grid, &path, extinctions, fields, pitch, turned);
+            },
+        );
+        let groups = groups(beams, extinctions.len());
+        let mut slabs: Vec<Vec<&mut [f32]>> = (0..nz).map(|_| Vec::with_capacity(planes.len())).collect();
+        for plane in &mut planes {
+            slabs.iter_mut().zip(plane.chunks_mut(nx * ny)).for_each(|(slab, part)| slab.push(part));
         }
-    });
-    total
+        slabs.into_par_iter().enumerate().for_each(|(k, mut slab)| {
+            for j in 0..ny {
+                let active = grid.active_x(j, k);
+                for start in (active.start / LANES * LANES..active.end).step_by(LANES) {
+                    let nodes = nx * j + start..nx * j + nx.min(start + LANES);
+                    for group in &groups {
+                        let at = group.extinction * field + (j + ny * k) * pitch + start;
+                        let mut sums = [[0.0f32; LANES]; GROUP];
+                        for (sum, &plane) in sums.iter_mut().zip(&group.planes) {
+                            sum[..nodes.len()].copy_from_slice(&slab[plane][nodes.clone()]);
+                        }
+                        add_beams(&held, at, &group.weights, &mut sums);
+                        for (sum, &plane) in sums.iter().zip(&group.planes) {
+                            slab[plane][nodes.clone()].copy_from_slice(&sum[..nodes.len()]);
+                        }
+                    }
+                }
+            }
+        });
+    }
+    planes
 }
 
-/// Beams that share an axis and a sense, in groups of at most an eighth of all (so that eight threads have work).
-fn bundles<'a>(grid: &SweepGrid, beams: &'a [WeightedBeam]) -> Vec<Bundle<'a>> {
-    let most = beams.len().div_ceil(8).max(1);
-    let mut groups: [Vec<(&WeightedBeam, Path)>; 6] = Default::default();
-    for beam in beams {
-        let path = grid.path(beam.beam.toward);
-        groups[path.group()].push((beam, path));
-    }
-    let chunk = |group: &Vec<(&'a WeightedBeam, Path)>| -> Vec<Bundle<'a>> {
-        group.chunks(most).map(|beams| Bundle { slices: beams[0].1.slices, beams: beams.to_vec() }).collect()
+/// Up to [`GROUP`] planes that need the same transmittances.
+struct Group {
+    extinction: usize,
+    planes: Vec<usize>,
+    /// For each beam; zero for planes that are not there.
+    weights: Vec<[f32; GROUP]>,
+}
+
+fn groups(beams: &[WeightedBeam], extinctions: usize) -> Vec<Group> {
+    let planes = beams.first().map_or(0, |b| b.weights.len() * 3);
+    let group = |extinction: usize, planes: &[usize]| {
+        let weight = |beam: &WeightedBeam| {
+            let mut weights = [0.0; GROUP];
+            weights.iter_mut().zip(planes).for_each(|(w, p)| *w = beam.weights[p / 3][p % 3]);
+            weights
+        };
+        Group { extinction, planes: planes.to_vec(), weights: beams.iter().map(weight).collect() }
     };
-    groups.iter().flat_map(chunk).collect()
+    let of = |extinction: usize| -> Vec<Group> {
+        let own: Vec<usize> = (0..planes).filter(|p| extinctions == 1 || p % 3 == extinction).collect();
+        own.chunks(GROUP).map(|planes| group(extinction, planes)).collect()
+    };
+    (0..extinctions).flat_map(of).collect()
+}
+
+/// Adds all beams, in their order, to the planes of a group in a block of nodes.
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn add_beams(held: &[Vec<f32>], at: usize, weights: &[[f32; GROUP]], sums: &mut [[f32; LANES]; GROUP]) {
+    // One variable each, or the compiler vectorises across the planes, with gathers.
+    let [mut s0, mut s1, mut s2, mut s3, mut s4, mut s5] = *sums;
+    for (held, weights) in held.iter().zip(weights) {
+        let Some(t) = held.get(at..).and_then(|h| h.first_chunk::<LANES>()) else { return };
+        add_scaled(&mut s0, weights[0], t);
+        add_scaled(&mut s1, weights[1], t);
+        add_scaled(&mut s2, weights[2], t);
+        add_scaled(&mut s3, weights[3], t);
+        add_scaled(&mut s4, weights[4], t);
+        add_scaled(&mut s5, weights[5], t);
+    }
+    *sums = [s0, s1, s2, s3, s4, s5];
+}
+
+#[inline(always)]
+fn add_scaled(sum: &mut [f32; LANES], weight: f32, values: &[f32; LANES]) {
+    for lane in 0..LANES {
+        sum[lane] += weight * values[lane];
+    }
 }
 
 /// The rays of one beam: optical depth (of density) so far, and the density where they last met a slice.
@@ -74,41 +137,57 @@ struct Rays {
     density: Vec<f32>,
 }
 
-fn sweep(grid: &SweepGrid, bundle: &Bundle, sigma_t: [f32; 3], out: &mut [Vec<f32>]) {
-    let slices = &bundle.slices;
+/// Transmittance of one beam to every node near density, for each extinction, in rows of `pitch`. `turned` is scratch.
+fn transmittances(
+    grid: &SweepGrid,
+    path: &Path,
+    extinctions: &[f32],
+    mut out: Vec<&mut [f32]>,
+    pitch: usize,
+    turned: &mut [f32],
+) {
+    let slices = &path.slices;
+    let [nx, ny, nz] = grid.dims;
     let density = grid.density(slices);
-    let mut rays: Vec<Rays> = bundle
-        .beams
-        .iter()
-        .map(|(_, path)| {
-            let len = path.extent[0] * path.extent[1];
-            Rays { depth: vec![0.0; len], density: vec![0.0; len] }
-        })
-        .collect();
-    let mut tau = vec![0.0; slices.columns];
-    for step in 0..slices.count {
-        for ((beam, path), rays) in bundle.beams.iter().zip(&mut rays) {
+    for (c, &sigma) in extinctions.iter().enumerate() {
+        let len = path.extent[0] * path.extent[1];
+        let mut rays = Rays { depth: vec![0.0; len], density: vec![0.0; len] };
+        let (target, pitch_here) = if slices.turned { (&mut *turned, ny) } else { (&mut *out[c], pitch) };
+        for step in 0..slices.count {
             let shift = path.shift(step);
-            advance(rays, path, &shift, density);
-            deposit(rays, path, &shift, sigma_t, &beam.weights, &mut tau, out);
+            advance(grid, &mut rays, path, &shift, density);
+            deposit(grid, &rays, path, &shift, sigma, target, pitch_here);
+        }
+        if slices.turned {
+            for k in 0..nz {
+                for block in (0..ny).step_by(16) {
+                    let rows = block..(block + 16).min(ny);
+                    let active = rows.clone().map(|j| grid.active_x(j, k)).filter(|r| !r.is_empty());
+                    let (start, end) = active.fold((nx, 0), |(s, e), r| (s.min(r.start), e.max(r.end)));
+                    for i in start..end {
+                        let source = &turned[ny * (k + nz * i)..];
+                        rows.clone().for_each(|j| out[c][(j + ny * k) * pitch + i] = source[j]);
+                    }
+                }
+            }
         }
     }
 }
 
 /// Carries every ray from the slice before to this one.
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn advance(rays: &mut Rays, path: &Path, shift: &Shift, density: &[f32]) {
+fn advance(grid: &SweepGrid, rays: &mut Rays, path: &Path, shift: &Shift, density: &[f32]) {
     let slices = &path.slices;
     let weights = shift.ray_weights();
     let half = 0.5 * path.length;
-    let n = slices.columns - 1;
     let mut met = [0.0; 256];
     for row in 0..slices.rows - 1 {
         let start = (shift.base[1] + row + 1) * path.extent[0] + shift.base[0] + 1;
         let low = &density[slices.row(shift.slice, row)..][..slices.columns];
         let high = &density[slices.row(shift.slice, row + 1)..][..slices.columns];
-        for block in (0..n).step_by(256) {
-            let len = (n - block).min(256);
+        let active = grid.active_rays(slices, shift.slice, row);
+        for block in active.clone().step_by(256) {
+            let len = (active.end - block).min(256);
             let met = &mut met[..len];
             stencil(met, &low[block..], &high[block..], weights);
             let depth = &mut rays.depth[start + block..][..len];
@@ -121,38 +200,22 @@ fn advance(rays: &mut Rays, path: &Path, shift: &Shift, density: &[f32]) {
     }
 }
 
-/// Adds the light that reaches each node of this slice.
+/// Writes the transmittance of the nodes of this slice.
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn deposit(
-    rays: &Rays,
-    path: &Path,
-    shift: &Shift,
-    sigma_t: [f32; 3],
-    weights: &[[f32; 3]],
-    tau: &mut [f32],
-    out: &mut [Vec<f32>],
-) {
+fn deposit(grid: &SweepGrid, rays: &Rays, path: &Path, shift: &Shift, sigma: f32, out: &mut [f32], pitch: usize) {
     let slices = &path.slices;
     let around = shift.node_weights();
-    let n = slices.columns;
-    let grey = sigma_t[0] == sigma_t[1] && sigma_t[0] == sigma_t[2];
     for row in 0..slices.rows {
-        let low = &rays.depth[(shift.base[1] + row) * path.extent[0] + shift.base[0]..][..n + 1];
-        let high = &rays.depth[(shift.base[1] + row + 1) * path.extent[0] + shift.base[0]..][..n + 1];
-        let target = slices.row(shift.slice, row);
-        for channel in 0..3 {
-            if channel == 0 || !grey {
-                let tau = &mut tau[..n];
-                stencil(tau, low, high, around);
-                let sigma = sigma_t[channel];
-                tau.iter_mut().for_each(|t| *t = exp_neg(sigma * *t));
-            }
-            for (coefficient, weight) in weights.iter().enumerate() {
-                let weight = weight[channel];
-                let plane = &mut out[coefficient * 3 + channel][target..][..n];
-                plane.iter_mut().zip(&tau[..n]).for_each(|(p, t)| *p += weight * t);
-            }
+        let active = grid.active(slices, shift.slice, row);
+        if active.is_empty() {
+            continue;
         }
+        let start = (shift.base[1] + row) * path.extent[0] + shift.base[0] + active.start;
+        let (low, high) = (&rays.depth[start..], &rays.depth[start + path.extent[0]..]);
+        let target = slices.row(shift.slice, row) / slices.columns * pitch + active.start;
+        let out = &mut out[target..][..active.len()];
+        stencil(out, low, high, around);
+        out.iter_mut().for_each(|t| *t = exp_neg(sigma * *t));
     }
 }
 
