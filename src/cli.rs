@@ -1,7 +1,6 @@
 //! The command line: subcommands and their options, and nothing that acts on them.
 //!
-//! Each option's variable and settings key come from its long name (see `layers`). A subcommand is in [`Command`] when
-//! there is an engine behind it; the options of the others stand ready below.
+//! Each option's variable and settings key come from its long name (see `layers`).
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use smoke_formats::sequence::FrameSelection;
@@ -25,16 +24,20 @@ pub struct Cli {
 /// What to do.
 #[derive(Debug, Subcommand)]
 pub enum Command {
-    /// Measure how far an image is from a reference: RMSE, PSNR, bias, largest error.
-    Compare(CompareArgs),
+    /// Bake a sequence of volumes into one pack.
+    Bake(BakeArgs),
+    /// Render frames of a pack to OpenEXR.
+    Render(RenderArgs),
     /// Show what a pack holds: sequence, settings, and sizes, errors and seconds of every frame.
     Inspect(InspectArgs),
     /// Check every byte of a pack and name the first thing that is wrong.
     Validate(ValidateArgs),
     /// Decode a pack's frames to OpenVDB or Mitsuba volumes.
     Unpack(UnpackArgs),
-    /// Render a pack's frames to OpenEXR: camera, lights and medium come from a scene file.
-    Render(Box<RenderArgs>),
+    /// Measure how far an image is from a reference: RMSE, PSNR, bias, largest error.
+    Compare(CompareArgs),
+    /// Bake and render a small plume that comes with the program, and relight it.
+    Demo(DemoArgs),
 }
 
 /// Options of `compare`.
@@ -131,6 +134,26 @@ pub enum ResidualAddress {
     Auto,
 }
 
+/// Which Gaussians are moved to where they are needed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum TeleportRule {
+    /// Several at once, by expected gain and loss.
+    #[default]
+    Batch,
+    /// The one of least integral, to the voxel of largest error (Zhou et al. 2008).
+    Single,
+}
+
+/// How many Gaussians later frames have.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum GaussianCount {
+    /// As many as the first, as far as they are of use.
+    #[default]
+    Steady,
+    /// What deletion and insertion by the error ratio leave (Zhou et al. 2008).
+    Adaptive,
+}
+
 /// How sections lie in the pack.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
 pub enum AtRest {
@@ -154,9 +177,9 @@ pub struct BakeArgs {
     pub grid: String,
     /// Frames to bake: 1001-1064, 1001-1064x2, 1,5,9 [default: all there are].
     #[arg(long, value_name = "RANGE")]
-    pub frames: Option<String>,
-    /// Gaussians in the first frame.
-    #[arg(long, value_name = "N", default_value_t = 1000, value_parser = clap::value_parser!(u32).range(1..=65536))]
+    pub frames: Option<FrameSelection>,
+    /// Gaussians in the first frame; 0 leaves everything to the residual.
+    #[arg(long, value_name = "N", default_value_t = 1000, value_parser = clap::value_parser!(u32).range(0..=65536))]
     pub gaussians: u32,
     /// Smallest radius, in lengths of the box's longest side.
     #[arg(long, value_name = "R", default_value_t = 0.015, value_parser = positive)]
@@ -170,12 +193,21 @@ pub struct BakeArgs {
     /// Largest weight, as a part of the largest density.
     #[arg(long, value_name = "W", default_value_t = 1.0, value_parser = positive)]
     pub weight_max: f64,
-    /// Most iterations of one minimisation.
-    #[arg(long, value_name = "N", default_value_t = 500)]
-    pub max_iterations: u32,
+    /// Evaluations of the fit's error in the first frame.
+    #[arg(long, value_name = "N", default_value_t = 200)]
+    pub first_evaluations: u32,
+    /// Evaluations of the fit's error in a later frame, without those after insertions.
+    #[arg(long, value_name = "N", default_value_t = 40)]
+    pub next_evaluations: u32,
     /// Iterations between two moves of the least useful Gaussian in the first frame; 0 for never.
     #[arg(long, value_name = "N", default_value_t = 20)]
     pub teleport_every: u32,
+    /// Which Gaussians move then.
+    #[arg(long, value_enum, default_value_t)]
+    pub teleport_rule: TeleportRule,
+    /// How many Gaussians a later frame has.
+    #[arg(long, value_enum, default_value_t)]
+    pub count: GaussianCount,
     /// Error over the first frame's error at which a later frame gets another Gaussian.
     #[arg(long, value_name = "RATIO", default_value_t = 1.1, value_parser = positive)]
     pub rho: f64,
@@ -206,10 +238,10 @@ pub struct BakeArgs {
     /// Read and check the input, say what would be done, write nothing.
     #[arg(long)]
     pub dry_run: bool,
-    /// Frames per second of the sequence, kept in the pack.
-    #[arg(long, value_name = "FPS", default_value_t = 24.0, value_parser = positive)]
-    pub fps: f64,
-    /// Seed of every random choice.
+    /// Frames per second of the sequence, kept in the pack [default: not stated].
+    #[arg(long, value_name = "FPS", value_parser = positive)]
+    pub fps: Option<f64>,
+    /// Seed of the search for perfect hashes, the only random choice.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
     /// Threads; the result does not depend on it [default: one for each core].
@@ -344,8 +376,14 @@ pub struct UnpackArgs {
 /// Options of `demo`.
 #[derive(Args, Debug)]
 pub struct DemoArgs {
-    /// The folder to fill: a pack, rendered frames and a contact sheet.
+    /// The folder to fill: the inputs, a pack, rendered frames and a contact sheet.
     pub output: PathBuf,
+    /// Threads; the result does not depend on it [default: one for each core].
+    #[arg(long, value_name = "N")]
+    pub threads: Option<usize>,
+    /// How progress is shown.
+    #[arg(long, value_enum, default_value_t)]
+    pub progress: ProgressMode,
 }
 
 fn positive(text: &str) -> Result<f64, String> {
@@ -408,10 +446,6 @@ mod tests {
     #[test]
     fn the_definitions_of_all_subcommands_are_sound() {
         Cli::command().debug_assert();
-        let all = clap::Command::new("all");
-        all.subcommand(BakeArgs::augment_args(clap::Command::new("bake")))
-            .subcommand(DemoArgs::augment_args(clap::Command::new("demo")))
-            .debug_assert();
     }
 
     fn parse<A: Args + FromArgMatches>(line: &[&str]) -> Result<A, clap::Error> {
@@ -426,7 +460,7 @@ mod tests {
         assert_eq!((args.psnr, args.max_error, args.residual), (Some(47.0), None, ResidualAddress::Auto));
         assert!(parse::<BakeArgs>(&["in", "-o", "a", "--psnr", "47", "--max-error", "0.1"]).is_err());
         assert!(parse::<BakeArgs>(&["in", "-o", "a", "--max-error", "nan"]).is_err());
-        assert!(parse::<BakeArgs>(&["in", "-o", "a", "--gaussians", "0"]).is_err());
+        assert!(parse::<BakeArgs>(&["in", "-o", "a", "--gaussians", "65537"]).is_err());
     }
 
     #[test]

@@ -43,6 +43,12 @@ impl From<Error> for Failure {
     }
 }
 
+impl From<smoke_baking::Error> for Failure {
+    fn from(error: smoke_baking::Error) -> Self {
+        Self::Work(error.to_string())
+    }
+}
+
 impl From<clap::Error> for Failure {
     fn from(error: clap::Error) -> Self {
         Self::Usage(error)

@@ -70,7 +70,8 @@ fn residual_name(kind: ResidualKind) -> &'static str {
     }
 }
 
-fn as_json(pack: &Pack, seconds: Option<&[Seconds]>) -> Result<Value, Failure> {
+/// The document of `--json`; `bake --json` prints the same of the pack it wrote.
+pub fn as_json(pack: &Pack, seconds: Option<&[Seconds]>) -> Result<Value, Failure> {
     let (sequence, totals) = (pack.sequence(), Totals::of(pack.frames()));
     // The reader has seen that it is JSON; numbers beyond f64 could still fail here.
     let settings: Value = serde_json::from_str(&pack.settings().json)
@@ -130,6 +131,20 @@ fn as_json(pack: &Pack, seconds: Option<&[Seconds]>) -> Result<Value, Failure> {
             "seconds": seconds.map(total_seconds),
         },
     }))
+}
+
+/// One line: what `bake` says of the pack it wrote.
+pub fn summary(pack: &Pack) -> String {
+    let totals = Totals::of(pack.frames());
+    format!(
+        "{}: {} frames, {} bytes, {} bits an active voxel at rest, {} resident; no voxel is off by more than {}\n",
+        pack.path().display(),
+        pack.frames().len(),
+        pack.file_bytes(),
+        number(totals.bits_a_voxel(totals.bytes_at_rest), 2),
+        number(totals.bits_a_voxel(totals.bytes_resident), 2),
+        small(totals.max_error),
+    )
 }
 
 fn as_text(pack: &Pack, seconds: Option<Vec<Seconds>>) -> String {

@@ -1,16 +1,16 @@
 //! smoke-bake: bakes smoke sequences into relightable packs, and renders them.
 
 mod answer;
+mod bake;
 mod cli;
 mod compare;
-#[cfg_attr(not(test), expect(dead_code, reason = "`demo` shows its frames with it"))]
 mod contact_sheet;
+mod demo;
 mod failure;
 mod inspect;
 mod layers;
 mod progress;
 mod render;
-#[cfg_attr(not(test), expect(dead_code, reason = "`bake` writes through it"))]
 mod seconds;
 #[cfg(test)]
 mod testing;
@@ -34,11 +34,18 @@ fn main() -> ExitCode {
 fn run() -> Result<(), Failure> {
     let command = layers::command(Path::new(layers::FILE_NAME))?;
     let matches = command.try_get_matches()?;
-    match Cli::from_arg_matches(&matches)?.command {
-        Command::Compare(args) => compare::run(&args),
+    dispatch(Cli::from_arg_matches(&matches)?.command)
+}
+
+/// Does what was asked.
+fn dispatch(command: Command) -> Result<(), Failure> {
+    match command {
+        Command::Bake(args) => bake::run(&args),
+        Command::Render(args) => render::run(&args),
         Command::Inspect(args) => inspect::run(&args),
         Command::Validate(args) => validate::run(&args),
         Command::Unpack(args) => unpack::run(&args),
-        Command::Render(args) => render::run(&args),
+        Command::Compare(args) => compare::run(&args),
+        Command::Demo(args) => demo::run(&args),
     }
 }

@@ -67,6 +67,19 @@ impl Progress {
         }
     }
 
+    /// What is being done now, within a step.
+    pub fn describe(&self, what: String) {
+        match &self.shown {
+            Shown::Bar(bar) => bar.set_message(what),
+            Shown::Lines(start, lines) => {
+                let mut lines = lines.lock().unwrap_or_else(|e| e.into_inner());
+                lines.what = what;
+                lines.advance(0, start.elapsed());
+            }
+            Shown::Nothing => {}
+        }
+    }
+
     /// Ends the bar and leaves its line.
     pub fn finish(self) {
         if let Shown::Bar(bar) = self.shown {
@@ -100,9 +113,14 @@ impl Lines {
             format!("openjd_progress: {:.1}", percent.min(100.0))
         } else {
             let rate = self.done as f64 / elapsed.as_secs_f64().max(1e-3);
-            let left = (self.total.saturating_sub(self.done)) as f64 / rate.max(1e-9);
             let counts = format!("{}/{} ({percent:.1} %)", self.done, self.total);
-            format!("{}: {counts}, {rate:.2}/s, {left:.0} s left", self.what)
+            if self.done == 0 {
+                // No rate yet, so nothing is known of the time left.
+                format!("{}: {counts}", self.what)
+            } else {
+                let left = self.total.saturating_sub(self.done) as f64 / rate;
+                format!("{}: {counts}, {rate:.2}/s, {left:.0} s left", self.what)
+            }
         };
         self.line(&line);
     }

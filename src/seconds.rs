@@ -4,6 +4,7 @@
 //! table of contents, so that times of another bake are never shown for this one.
 
 use serde::{Deserialize, Serialize};
+pub use smoke_baking::pipeline::Seconds;
 use smoke_formats::pack::Pack;
 use smoke_formats::{Error, Result, atomic};
 use std::io::Read;
@@ -11,21 +12,6 @@ use std::path::{Path, PathBuf};
 
 /// Largest file that is read: a million frames.
 const MAX_BYTES: u64 = 256 << 20;
-
-/// Wall seconds of one frame, stage by stage.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Deserialize, Serialize)]
-pub struct Seconds {
-    /// Reading and checking the volume.
-    pub read: f64,
-    /// Fitting the Gaussians.
-    pub fit: f64,
-    /// Quantising the residual.
-    pub residual: f64,
-    /// Searching the perfect hash; a tile's time is shared out evenly.
-    pub hash: f64,
-    /// Coding and writing.
-    pub write: f64,
-}
 
 #[derive(Deserialize, Serialize)]
 struct Row {

@@ -44,7 +44,8 @@ fn plume(shift: f32) -> (DensityGrid, UnitSpace) {
 fn objective_and_gradient(bencher: Bencher, n: usize) {
     let (grid, space) = plume(0.0);
     let objective = Objective::new(&grid, &space, Scope::Box).unwrap();
-    let x = initial(&grid, &objective, n);
+    let bounds = FitSettings::default().bounds().unwrap();
+    let x = initial(&grid, &objective, n, &bounds);
     let mut gradient = vec![0.0; n * VARIABLES];
     bencher.bench_local(|| objective.cost_gradient(&x, &mut gradient));
 }

@@ -6,6 +6,7 @@
 
 use argmin::core::Executor;
 use smoke_baking::fit::descent::Descent;
+use smoke_baking::fit::frame::FitSettings;
 use smoke_baking::fit::initial::initial;
 use smoke_baking::fit::lbfgsb::{CostGradient, Lbfgsb, State};
 use smoke_baking::fit::objective::{Objective, Scope};
@@ -85,10 +86,11 @@ fn volume(path: &str, n: usize, evaluations: usize, start: &str) -> Result<Vec<(
         values,
         world_from_index: Default::default(),
     };
+    let bounds = FitSettings::default().bounds()?;
     let objective = Objective::new(&grid, &UnitSpace::of_box([0; 3], dims), Scope::Box).ok_or("no density")?;
-    let x = initial(&grid, &objective, n);
+    let x = initial(&grid, &objective, n, &bounds);
     std::fs::write(start, x.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<u8>>())?;
-    let mut descent = Descent::new(&objective, x, 20, 0.0, evaluations)?;
+    let mut descent = Descent::new(&objective, x, bounds, 20, 0.0, evaluations)?;
     let mut trace = vec![(descent.evaluations(), descent.cost)];
     while descent.advance(1)? && descent.evaluations() < evaluations {
         trace.push((descent.evaluations(), descent.cost));

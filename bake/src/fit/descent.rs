@@ -4,10 +4,43 @@ use super::lbfgsb::{CostGradient, Lbfgsb, State};
 use super::objective::{Objective, VARIABLES, natural_units};
 use argmin::core::{Error, Executor};
 
-/// The radii that a fit may use, in unit space (Zhou et al. 2008, section 5.1).
-pub const RADII: [f64; 2] = [0.015, 0.09];
-/// The weights that a fit may use, over the largest density.
-pub const WEIGHTS: [f64; 2] = [0.01, 1.0];
+/// The radii and weights that a fit may use, smallest and largest: positive, finite, in order.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Bounds {
+    /// In unit space.
+    pub radius: [f64; 2],
+    /// Over the largest density.
+    pub weight: [f64; 2],
+}
+
+impl Bounds {
+    /// The nearest radius inside.
+    pub fn radius(&self, radius: f64) -> f64 {
+        radius.clamp(self.radius[0], self.radius[1])
+    }
+
+    /// The nearest weight inside.
+    pub fn weight(&self, weight: f64) -> f64 {
+        weight.clamp(self.weight[0], self.weight[1])
+    }
+
+    /// Brings variables inside.
+    fn confine(&self, x: &mut [f64]) {
+        for g in x.chunks_mut(VARIABLES) {
+            (g[3], g[4]) = (self.radius(g[3]), self.weight(g[4]));
+        }
+    }
+
+    /// The bounds of variables measured in `units`, lower and upper.
+    fn scaled(&self, units: &[f64]) -> (Vec<f64>, Vec<f64>) {
+        let of = |k: usize| match k % VARIABLES {
+            3 => self.radius,
+            4 => self.weight,
+            _ => [f64::NEG_INFINITY, f64::INFINITY],
+        };
+        units.iter().enumerate().map(|(k, u)| (of(k)[0] / u, of(k)[1] / u)).unzip()
+    }
+}
 
 /// The objective in variables `z = x / unit`.
 struct Scaled<'a> {
@@ -27,6 +60,7 @@ impl CostGradient for Scaled<'_> {
 /// Variables, cost, gradient and the solver that moves them.
 pub struct Descent<'a> {
     objective: &'a Objective,
+    bounds: Bounds,
     solver: Lbfgsb,
     units: Vec<f64>,
     /// Per Gaussian: centre, radius, weight.
@@ -42,16 +76,17 @@ pub struct Descent<'a> {
 }
 
 impl<'a> Descent<'a> {
-    /// A minimisation from `x`, with `memory` pairs, of at most `evaluations` of the objective.
+    /// A minimisation from `x` inside `bounds`, with `memory` pairs, of at most `evaluations` of the objective.
     pub fn new(
         objective: &'a Objective,
         x: Vec<f64>,
+        bounds: Bounds,
         memory: usize,
         tolerance: f64,
         evaluations: usize,
     ) -> Result<Self, Error> {
         let units = natural_units(&x, objective);
-        let (lower, upper) = bounds(&units);
+        let (lower, upper) = bounds.scaled(&units);
         let solver = Lbfgsb::new(lower, upper, memory)?
             .gradient_tolerance(1e-9)
             .cost_tolerance(tolerance)
@@ -59,6 +94,7 @@ impl<'a> Descent<'a> {
             .first_step(0.5);
         let mut new = Self {
             objective,
+            bounds,
             solver,
             units,
             x,
@@ -100,7 +136,8 @@ impl<'a> Descent<'a> {
         let z = result.state.take_param().unwrap_or_default();
         let gradient = result.state.take_gradient().unwrap_or_default();
         self.x = z.iter().zip(&self.units).map(|(z, u)| z * u).collect();
-        confine(&mut self.x);
+        // The rounding of scaled bounds.
+        self.bounds.confine(&mut self.x);
         self.gradient = gradient.iter().zip(&self.units).map(|(g, u)| g / u).collect();
         self.solver = result.solver;
         Ok(())
@@ -109,6 +146,11 @@ impl<'a> Descent<'a> {
     /// The objective.
     pub fn objective(&self) -> &'a Objective {
         self.objective
+    }
+
+    /// The bounds.
+    pub fn bounds(&self) -> Bounds {
+        self.bounds
     }
 
     /// Puts the variables of some Gaussians where they are in `x`, if that lowers the cost; tells whether it did.
@@ -142,7 +184,7 @@ impl<'a> Descent<'a> {
         }
         (self.x, self.gradient, self.cost, self.finished) = (x, gradient, cost, false);
         let units = natural_units(gaussians.as_flattened(), self.objective);
-        let (lower, upper) = bounds(&units);
+        let (lower, upper) = self.bounds.scaled(&units);
         self.units.extend(units);
         self.solver.append(&lower, &upper);
         true
@@ -158,26 +200,7 @@ impl<'a> Descent<'a> {
     pub fn rescale(&mut self) {
         let old = std::mem::replace(&mut self.units, natural_units(&self.x, self.objective));
         let ratio: Vec<f64> = old.iter().zip(&self.units).map(|(old, new)| old / new).collect();
-        let (lower, upper) = bounds(&self.units);
+        let (lower, upper) = self.bounds.scaled(&self.units);
         self.solver.rescale(&ratio, lower, upper);
-    }
-}
-
-/// The bounds of the scaled variables.
-fn bounds(units: &[f64]) -> (Vec<f64>, Vec<f64>) {
-    let none = f64::INFINITY;
-    let of = |k: usize| match k % VARIABLES {
-        3 => (RADII[0], RADII[1]),
-        4 => (WEIGHTS[0], WEIGHTS[1]),
-        _ => (-none, none),
-    };
-    units.iter().enumerate().map(|(k, u)| (of(k).0 / u, of(k).1 / u)).unzip()
-}
-
-/// Removes the rounding of scaled bounds.
-fn confine(x: &mut [f64]) {
-    for g in x.chunks_mut(VARIABLES) {
-        g[3] = g[3].clamp(RADII[0], RADII[1]);
-        g[4] = g[4].clamp(WEIGHTS[0], WEIGHTS[1]);
     }
 }

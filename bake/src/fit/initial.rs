@@ -1,11 +1,11 @@
 //! Where a first fit starts: Gaussians spread over the density, one for an equal share of it each.
 //!
 //! The non-zero voxels are put in Morton order, which keeps neighbours together, and cut into n strata of equal
-//! `sum D`; each stratum gives one Gaussian at its centroid, with radius [`RADIUS`] times the edge of a cube of its volume.
+//! `sum D`; each stratum gives one Gaussian at its centroid, with radius 0.7 times the edge of a cube of its volume.
 //! All weights then follow from one factor, `<S, D> / <S, S>`: the least-squares best for those centres and radii.
 //! Cost: one sort of the occupied voxels, one evaluation.
 
-use super::descent::{RADII, WEIGHTS};
+use super::descent::Bounds;
 use super::objective::{Objective, VARIABLES};
 use smoke_formats::volume::DensityGrid;
 
@@ -17,8 +17,8 @@ fn spread(v: usize) -> u64 {
     (0..21).fold(0, |code, bit| code | ((v as u64 >> bit) & 1) << (3 * bit))
 }
 
-/// Starting variables of `n` Gaussians for a grid whose objective exists.
-pub fn initial(grid: &DensityGrid, objective: &Objective, n: usize) -> Vec<f64> {
+/// Starting variables of at most `n` Gaussians, inside `bounds`, for a grid whose objective exists.
+pub fn initial(grid: &DensityGrid, objective: &Objective, n: usize, bounds: &Bounds) -> Vec<f64> {
     let [nx, ny, _] = grid.dims;
     let mut voxels: Vec<(u64, usize)> = (0..grid.len())
         .filter(|&v| grid.values[v] > 0.0)
@@ -44,10 +44,10 @@ pub fn initial(grid: &DensityGrid, objective: &Objective, n: usize) -> Vec<f64> 
             continue;
         }
         let volume = (at - first) as f64 * voxel_volume;
-        let r = (RADIUS * volume.cbrt()).clamp(RADII[0], RADII[1]);
+        let r = bounds.radius(RADIUS * volume.cbrt());
         let w = voxels[first..at].iter().map(|&(_, v)| f64::from(grid.values[v])).sum::<f64>() / (at - first) as f64;
         let w = w / f64::from(objective.peak());
-        x.extend([centre[0] / mass, centre[1] / mass, centre[2] / mass, r, w.clamp(WEIGHTS[0], WEIGHTS[1])]);
+        x.extend([centre[0] / mass, centre[1] / mass, centre[2] / mass, r, bounds.weight(w)]);
     }
     let (mut sd, mut ss) = (0.0, 0.0);
     objective.errors(&x).visit(|_, e, d| {
@@ -56,6 +56,6 @@ pub fn initial(grid: &DensityGrid, objective: &Objective, n: usize) -> Vec<f64> 
         ss += (e + d) * (e + d);
     });
     let factor = if ss > 0.0 { sd / ss } else { 1.0 };
-    x.chunks_mut(VARIABLES).for_each(|g| g[4] = (g[4] * factor).clamp(WEIGHTS[0], WEIGHTS[1]));
+    x.chunks_mut(VARIABLES).for_each(|g| g[4] = bounds.weight(g[4] * factor));
     x
 }

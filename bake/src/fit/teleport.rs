@@ -10,7 +10,7 @@
 //! The optimiser keeps its memory, less the entries of the variables moved. A move that does not lower the cost
 //! is undone. Cost: a forward pass, three moments a candidate, and one evaluation.
 
-use super::descent::{Descent, RADII, WEIGHTS};
+use super::descent::Descent;
 use super::objective::{ErrorField, VARIABLES};
 use rayon::prelude::*;
 
@@ -82,7 +82,8 @@ fn single(descent: &mut Descent, voxel: Option<usize>) -> usize {
     });
     let [cx, cy, cz] = descent.objective().position(at);
     let mut x = descent.x.clone();
-    let new = [cx, cy, cz, SINGLE_RADIUS, f64::from(error).clamp(WEIGHTS[0], WEIGHTS[1])];
+    let bounds = descent.bounds();
+    let new = [cx, cy, cz, bounds.radius(SINGLE_RADIUS), bounds.weight(f64::from(error))];
     x[least * VARIABLES..(least + 1) * VARIABLES].copy_from_slice(&new);
     usize::from(descent.try_move(x, &[least]))
 }
@@ -97,7 +98,7 @@ pub struct Candidate {
 
 /// Up to `most` places for new Gaussians, well apart, the best first.
 pub fn places(descent: &Descent, errors: &ErrorField, most: usize) -> Vec<Candidate> {
-    let lattice = descent.objective().lattice();
+    let (lattice, bounds) = (descent.objective().lattice(), descent.bounds());
     let n = descent.x.len() / VARIABLES;
     let mean = descent.x.chunks(VARIABLES).map(|g| g[3]).sum::<f64>() / n.max(1) as f64;
     // Missing density, and its first moments, in cells of a mean radius.
@@ -122,11 +123,11 @@ pub fn places(descent: &Descent, errors: &ErrorField, most: usize) -> Vec<Candid
             lattice.space.offset[a] + lattice.space.scale * (f64::from(lattice.origin[a]) + local[a] / m)
         });
         let tries = CANDIDATE_RADII.map(|f| {
-            let radius = (f * mean).clamp(RADII[0], RADII[1]);
+            let radius = bounds.radius(f * mean);
             let (weight, gain) = errors.gain(center, radius);
-            Candidate { gaussian: [center[0], center[1], center[2], radius, weight.min(WEIGHTS[1])], gain }
+            Candidate { gaussian: [center[0], center[1], center[2], radius, weight.min(bounds.weight[1])], gain }
         });
-        tries.into_iter().max_by(|a, b| a.gain.total_cmp(&b.gain)).filter(|c| c.gaussian[4] >= WEIGHTS[0])
+        tries.into_iter().max_by(|a, b| a.gain.total_cmp(&b.gain)).filter(|c| c.gaussian[4] >= bounds.weight[0])
     };
     let mut candidates: Vec<Candidate> = order.par_iter().filter_map(best_at).collect();
     candidates.sort_by(|a, b| b.gain.total_cmp(&a.gain));

@@ -8,8 +8,10 @@
 //! frames u32 | m u32 | r u32 | deflated offsets: length u64 | each frame: length u64 | deflated offsets | coded frames
 //! ```
 
+use super::gaussians::{self, GAUSSIAN_BYTES};
 use super::records::Codec;
 use crate::bounded::Bytes;
+use crate::gaussian::Gaussian;
 use crate::residual::hash::{HashTable, HashView, MAX_FRAMES};
 use crate::residual::rank::RankView;
 use crate::residual::{Residual, ResidualCodes, coded, hash, rank};
@@ -45,14 +47,26 @@ pub fn inflate(path: &Path, what: &str, packed: &[u8], expected: u64) -> Result<
     }
 }
 
-/// A rank section at rest, and the number of its resident bytes.
-pub fn encode_rank(codes: &ResidualCodes, codec: Codec) -> (Vec<u8>, u64) {
-    let resident = rank::encode(codes);
-    let length = resident.len() as u64;
+/// The Gaussians of a section at rest that claims `resident` bytes; `what` names the frame in errors.
+pub fn decode_gaussians(path: &Path, what: &str, bytes: &[u8], codec: Codec, resident: u64) -> Result<Vec<Gaussian>> {
+    let list = match codec {
+        Codec::Snapped => gaussians::decode(path, bytes)?,
+        Codec::Deflate => gaussians::from_bytes(path, what, &inflate(path, what, bytes, resident)?)?,
+        Codec::Raw | Codec::Coded => gaussians::from_bytes(path, what, bytes)?,
+    };
+    if (list.len() * GAUSSIAN_BYTES) as u64 != resident {
+        return Err(Error::invalid(path, format!("{what}.gaussians"), list.len(), resident / GAUSSIAN_BYTES as u64));
+    }
+    gaussians::check(path, what, &list)?;
+    Ok(list)
+}
+
+/// A rank section at rest; `resident` is the rank layout of `codes`.
+pub fn encode_rank(codes: &ResidualCodes, resident: &[u8], codec: Codec) -> Vec<u8> {
     match codec {
-        Codec::Coded => (coded::encode(codes), length),
-        Codec::Deflate => (deflate(&resident), length),
-        Codec::Raw | Codec::Snapped => (resident, length),
+        Codec::Coded => coded::encode(codes),
+        Codec::Deflate => deflate(resident),
+        Codec::Raw | Codec::Snapped => resident.to_vec(),
     }
 }
 
@@ -141,9 +155,10 @@ mod tests {
         let path = Path::new("p");
         for frame in frames_of_every_kind() {
             for codec in CODECS {
-                let (bytes, resident) = encode_rank(&frame, codec);
-                let back = decode_rank(path, bytes, codec, resident).unwrap();
-                assert_eq!(back.bytes(), rank::encode(&frame));
+                let resident = rank::encode(&frame);
+                let bytes = encode_rank(&frame, &resident, codec);
+                let back = decode_rank(path, bytes, codec, resident.len() as u64).unwrap();
+                assert_eq!(back.bytes(), resident);
                 assert_eq!(back.codes(0).unwrap(), frame);
             }
         }
@@ -166,12 +181,13 @@ mod tests {
     fn every_prefix_an_extra_byte_and_a_wrong_length_are_refused_by_every_codec() {
         let path = Path::new("p");
         let frames = [ball([9, 8, 7], 60, 1)];
+        let resident = rank::encode(&frames[0]);
         let hash = |codec, bytes: &[u8], resident| decode_hash(path, bytes.to_vec(), codec, resident);
         let rank = |codec, bytes: &[u8], resident| decode_rank(path, bytes.to_vec(), codec, resident);
         type Decode<'a> = &'a dyn Fn(Codec, &[u8], u64) -> Result<Residual>;
         for codec in CODECS {
             let kinds: [(Decode, (Vec<u8>, u64)); 2] = [
-                (&rank, encode_rank(&frames[0], codec)),
+                (&rank, (encode_rank(&frames[0], &resident, codec), resident.len() as u64)),
                 (&hash, encode_hash(path, &frames, &trivial(&frames), codec).unwrap()),
             ];
             for (decode, (bytes, resident)) in kinds {

@@ -6,18 +6,21 @@
 //! | [`records`] | what is said about sequence, settings, frames and sections |
 //! | [`gaussians`] | Gaussians at rest: plain, or at 16 bits a parameter |
 //! | [`at_rest`] | a section's bytes at rest and resident |
+//! | [`encoded`] | a frame at rest, before it is in a pack |
 //! | [`writer`] | frames in, a file out |
 //! | [`reader`] | one frame out, without reading the others |
 //! | [`validate`] | the first thing that is wrong with a file |
 
 pub mod at_rest;
 pub mod container;
+pub mod encoded;
 pub mod gaussians;
 pub mod reader;
 pub mod records;
 mod validate;
 pub mod writer;
 
+pub use encoded::EncodedFrame;
 pub use gaussians::snap_gaussians;
 pub use reader::{FrameResidual, Pack};
 pub use records::{Codec, FrameRecord, Promise, ResidualKind, SequenceRecord, SettingsRecord};

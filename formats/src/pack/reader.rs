@@ -7,15 +7,13 @@
 //! Files are read at positions rather than mapped: a map needs unsafe code, and a file that another process cuts short
 //! would end the program instead of giving an error. The one copy is small beside the checksum and the checks.
 
-use super::at_rest::{decode_hash, decode_rank, inflate};
+use super::at_rest::{decode_gaussians, decode_hash, decode_rank};
 use super::container::{
     HEADER_BYTES, Header, KIND_FRAMES, KIND_GAUSSIANS, KIND_HASH, KIND_RANK, KIND_SEQUENCE, KIND_SETTINGS, codec_of,
     decode_toc,
 };
-use super::gaussians::{self, GAUSSIAN_BYTES};
 use super::records::{
-    Codec, FrameRecord, MAX_RECORD_BYTES, ResidualKind, SectionRecord, SequenceRecord, SettingsRecord, decode,
-    kind_name,
+    FrameRecord, MAX_RECORD_BYTES, ResidualKind, SectionRecord, SequenceRecord, SettingsRecord, decode, kind_name,
 };
 use crate::gaussian::Gaussian;
 use crate::residual::{Residual, ResidualCodes};
@@ -165,19 +163,12 @@ impl Pack {
         let what = format!("frames[{frame}]");
         let section = &self.toc[self.section(frame)?.0];
         let bytes = self.section_bytes(&what, section)?;
-        let list = match codec_of(&self.path, &what, section)? {
-            Codec::Snapped => gaussians::decode(&self.path, &bytes)?,
-            Codec::Deflate => {
-                let resident = inflate(&self.path, &what, &bytes, section.bytes_resident)?;
-                gaussians::from_bytes(&self.path, &what, &resident)?
-            }
-            Codec::Raw | Codec::Coded => gaussians::from_bytes(&self.path, &what, &bytes)?,
-        };
+        let codec = codec_of(&self.path, &what, section)?;
+        let list = decode_gaussians(&self.path, &what, &bytes, codec, section.bytes_resident)?;
         let expected = u64::from(self.frames[frame].gaussians);
-        if list.len() as u64 != expected || section.bytes_resident != expected * GAUSSIAN_BYTES as u64 {
+        if list.len() as u64 != expected {
             return Err(Error::invalid(&self.path, format!("{what}.gaussians"), list.len(), expected));
         }
-        gaussians::check(&self.path, &what, &list)?;
         Ok(list)
     }
 

@@ -32,6 +32,13 @@ pub enum Codec {
     Snapped = 3,
 }
 
+impl Codec {
+    /// The codec of a number in a file, if it is one.
+    pub fn from_number(number: u32) -> Option<Self> {
+        [Self::Raw, Self::Coded, Self::Deflate, Self::Snapped].into_iter().find(|&c| c as u32 == number)
+    }
+}
+
 /// One entry of the table of contents.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SectionRecord {

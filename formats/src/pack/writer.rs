@@ -3,11 +3,12 @@
 //! The header is written last, over a blank one, so that an unfinished file is never mistaken for a pack; [`write()`] adds
 //! a temporary file and a rename. The same input gives the same bytes: nothing here knows the time or the machine.
 
-use super::at_rest::{deflate, encode_hash, encode_rank};
+use super::at_rest::encode_hash;
 use super::container::{
     ALIGNMENT, HEADER_BYTES, Header, KIND_FRAMES, KIND_GAUSSIANS, KIND_HASH, KIND_RANK, KIND_SEQUENCE, KIND_SETTINGS,
 };
-use super::gaussians::{self, GAUSSIAN_BYTES};
+use super::encoded::EncodedFrame;
+use super::gaussians::GAUSSIAN_BYTES;
 use super::records::{Codec, FrameRecord, ResidualKind, SectionRecord, SequenceRecord, SettingsRecord, encode};
 use crate::gaussian::Gaussian;
 use crate::residual::ResidualCodes;
@@ -73,16 +74,17 @@ impl<W: Write + Seek> PackWriter<W> {
 
     /// The next frame, its residual in the rank layout.
     pub fn push_rank(&mut self, frame: &FrameData, at_rest: AtRest) -> Result<()> {
-        frame.codes.check(&self.path)?;
+        let encoded = EncodedFrame::new(&self.path, frame, at_rest)?;
+        self.push_encoded(&encoded)
+    }
+
+    /// The next frame, encoded before.
+    pub fn push_encoded(&mut self, frame: &EncodedFrame) -> Result<()> {
         let number = self.frames.len() as u32;
-        let mut record = self.push_gaussians(number, frame, at_rest.gaussians)?;
-        let (bytes, resident) = encode_rank(frame.codes, at_rest.residual);
-        self.section(KIND_RANK, at_rest.residual, number..number + 1, &bytes, resident)?;
-        record.residual = ResidualKind::Rank;
-        record.rank_bytes = resident;
-        record.bytes_at_rest += bytes.len() as u64;
-        record.bytes_resident += resident;
-        self.frames.push(record);
+        self.push_gaussians(number, frame)?;
+        let resident = frame.record.rank_bytes;
+        self.section(KIND_RANK, frame.at_rest.residual, number..number + 1, &frame.residual, resident)?;
+        self.frames.push(frame.record);
         Ok(())
     }
 
@@ -95,8 +97,16 @@ impl<W: Write + Seek> PackWriter<W> {
         let first = self.frames.len() as u32;
         let mut records = vec![];
         for (number, frame) in (first..).zip(tile) {
-            frame.codes.check(&self.path)?;
-            records.push(self.push_gaussians(number, frame, at_rest.gaussians)?);
+            // Only the Gaussians are taken of it; the residual goes into the tile's own section.
+            let encoded = EncodedFrame::new(&self.path, frame, AtRest { residual: Codec::Raw, ..at_rest })?;
+            self.push_gaussians(number, &encoded)?;
+            let residual = (encoded.residual.len() as u64, encoded.record.rank_bytes);
+            records.push(FrameRecord {
+                bytes_at_rest: encoded.record.bytes_at_rest - residual.0,
+                bytes_resident: encoded.record.bytes_resident - residual.1,
+                rank_bytes: frame.record.rank_bytes,
+                ..encoded.record
+            });
         }
         let codes: Vec<ResidualCodes> = tile.iter().map(|f| f.codes.clone()).collect();
         let (bytes, resident) = encode_hash(&self.path, &codes, table, at_rest.residual)?;
@@ -147,30 +157,9 @@ impl<W: Write + Seek> PackWriter<W> {
         Ok(header.file_bytes)
     }
 
-    /// Writes the Gaussians of a frame and starts its record.
-    fn push_gaussians(&mut self, number: u32, frame: &FrameData, codec: Codec) -> Result<FrameRecord> {
-        gaussians::check(&self.path, &format!("frames[{number}]"), frame.gaussians)?;
-        let plain: Vec<u8> = frame.gaussians.iter().flat_map(gaussians::to_bytes).collect();
-        let resident = plain.len() as u64;
-        debug_assert_eq!(resident as usize, frame.gaussians.len() * GAUSSIAN_BYTES);
-        let bytes = match codec {
-            Codec::Raw => plain,
-            Codec::Deflate => deflate(&plain),
-            Codec::Snapped => gaussians::encode(&self.path, frame.gaussians)?,
-            Codec::Coded => {
-                return Err(Error::invalid(&self.path, "gaussians.codec", "Coded", "Raw, Deflate, Snapped"));
-            }
-        };
-        self.section(KIND_GAUSSIANS, codec, number..number + 1, &bytes, resident)?;
-        Ok(FrameRecord {
-            origin: frame.codes.origin,
-            dims: frame.codes.dims,
-            active_voxels: frame.codes.codes.len() as u64,
-            gaussians: frame.gaussians.len() as u32,
-            bytes_at_rest: bytes.len() as u64,
-            bytes_resident: resident,
-            ..frame.record
-        })
+    fn push_gaussians(&mut self, number: u32, frame: &EncodedFrame) -> Result<()> {
+        let resident = u64::from(frame.record.gaussians) * GAUSSIAN_BYTES as u64;
+        self.section(KIND_GAUSSIANS, frame.at_rest.gaussians, number..number + 1, &frame.gaussians, resident)
     }
 
     fn section(

@@ -14,8 +14,8 @@
 pub mod brick;
 mod code_model;
 pub mod coded;
-pub mod hash;
 mod earlier;
+pub mod hash;
 mod least_squares;
 mod logistic;
 mod mixing;

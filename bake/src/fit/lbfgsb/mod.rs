@@ -1,12 +1,12 @@
 //! L-BFGS-B: minimises a smooth function under bounds, as an [`argmin`] solver.
 //!
-//! Per iteration: the generalised Cauchy point along the projected gradient ([`cauchy`]), the minimum of the quadratic
-//! model over the variables that are free there ([`subspace`]), and a Moré–Thuente search towards it
-//! ([`line_search`]). Byrd, Lu, Nocedal, Zhu 1995 (SIAM J. Sci. Comput. 16, 1190); the projection of the subspace
+//! Per iteration: the generalised Cauchy point along the projected gradient (`cauchy`), the minimum of the quadratic
+//! model over the variables that are free there (`subspace`), and a Moré–Thuente search towards it
+//! (`line_search`). Byrd, Lu, Nocedal, Zhu 1995 (SIAM J. Sci. Comput. 16, 1190); the projection of the subspace
 //! minimum is that of version 3.0 (Morales, Nocedal 2011, ACM TOMS 38). About `20 m n` operations beside the objective.
 //!
 //! A cost or gradient that is not finite is an error at the start; in a line search the step is cut tenfold instead,
-//! at most [`MAX_RETREATS`] times, then it is an error too.
+//! at most 10 times, then it is an error too.
 
 mod cauchy;
 mod line_search;

@@ -1,0 +1,295 @@
+//! The bake: a surveyed sequence to a pack, frame after frame.
+//!
+//! Each frame starts from the Gaussians of the one before *as they lie in the pack*, so the state of a bake is what is
+//! already written: an interrupted one goes on from its work folder and ends with the same bytes.
+//! Memory: one frame, and the codes of one tile of 27 frames where a hash is to be tried.
+
+use crate::fit::frame::{Fit, FitProgress, FitSettings, fit_first, fit_next};
+use crate::residual::quantise::{Target, quantise};
+use crate::residual::tile::{ResidualMode, choose};
+use crate::survey::{Survey, SurveyedFrame, hash_file, read_density};
+use crate::work::Work;
+use crate::{Error, Result};
+use rayon::prelude::*;
+use smoke_formats::gaussian::{Gaussian, UnitSpace};
+use smoke_formats::pack::{
+    self, AtRest, EncodedFrame, FrameData, FrameRecord, Promise, SequenceRecord, SettingsRecord,
+};
+use smoke_formats::residual::ResidualCodes;
+use smoke_formats::residual::hash::{HashTable, MAX_FRAMES};
+use smoke_formats::volume::DensityGrid;
+use smoke_runtime::medium::gaussian_sum::gaussian_sum;
+use std::path::Path;
+use std::time::Instant;
+
+/// Everything that decides the bytes of a pack, besides the frames themselves.
+#[derive(Clone, Debug, PartialEq)]
+pub struct BakeSettings {
+    /// Name of the sequence, for people.
+    pub name: String,
+    /// The fit.
+    pub fit: FitSettings,
+    /// What is promised; none is [`default_promise`].
+    pub promise: Option<Promise>,
+    /// The residual's resident layout.
+    pub residual: ResidualMode,
+    /// Sections coded, or raw to be mapped.
+    pub at_rest: AtRest,
+    /// Frames a second, if known.
+    pub frames_per_second: Option<f64>,
+    /// Seed of the search for hashes.
+    pub seed: u64,
+}
+
+/// 8 bits: no voxel is further off than 1/510 of the sequence's largest density.
+pub fn default_promise(survey: &Survey) -> Promise {
+    // An empty sequence has no scale of its own; any promise holds.
+    let peak = if survey.density_max > 0.0 { f64::from(survey.density_max) } else { 1.0 };
+    Promise::MaxError(peak / 510.0)
+}
+
+/// Seconds that a frame took, by stage.
+#[derive(Clone, Copy, Debug, Default, PartialEq, serde::Deserialize, serde::Serialize)]
+pub struct Seconds {
+    /// Reading and checking the source.
+    pub read: f64,
+    /// Fitting Gaussians.
+    pub fit: f64,
+    /// Summing them and quantising what they miss.
+    pub residual: f64,
+    /// Laying out the codes: ranks, and the frame's share of its tile's hash.
+    pub hash: f64,
+    /// Coding and writing.
+    pub write: f64,
+}
+
+/// What a bake tells while it works.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Event {
+    /// A fit goes on.
+    Fit {
+        /// Frame number.
+        frame: i32,
+        /// Where it is.
+        progress: FitProgress,
+    },
+    /// A frame is done.
+    Frame {
+        /// What is known of it; sizes of the hash come later.
+        record: FrameRecord,
+        /// How long it took; none for a frame that an interrupted bake had finished.
+        seconds: Option<Seconds>,
+    },
+    /// A tile of frames is laid out: its share of seconds goes to each frame's `hash`.
+    Tile {
+        /// Frames of the tile.
+        frames: Vec<i32>,
+        /// Seconds for all of them.
+        seconds: f64,
+    },
+}
+
+/// Bakes a surveyed sequence to the file `output`.
+///
+/// `settings_json` is the JSON document that the pack keeps of its settings. With `resume`, frames that an interrupted
+/// bake of the same settings and sources finished are taken over.
+pub fn bake(
+    survey: &Survey,
+    settings: &BakeSettings,
+    settings_json: &str,
+    output: &Path,
+    resume: bool,
+    observe: &mut dyn FnMut(Event),
+) -> Result<()> {
+    let work = Work::open(output, &fingerprint(survey, settings_json), resume)?;
+    let space = UnitSpace::of_box(survey.origin, survey.dims);
+    let promise = settings.promise.unwrap_or_else(|| default_promise(survey));
+    let target = match promise {
+        Promise::MaxError(error) => Target::MaxError(error),
+        Promise::Psnr(db) => Target::Psnr { db, peak: survey.density_max },
+    };
+    let mut before: Option<Before> = None;
+    for frame in &survey.frames {
+        let encoded = match work.load(frame.number) {
+            Some(done) => {
+                observe(Event::Frame { record: *done.record(), seconds: None });
+                done
+            }
+            None => {
+                let (encoded, seconds) =
+                    bake_frame(survey, frame, &space, settings, target, before.as_ref(), output, observe)?;
+                let start = Instant::now();
+                work.store(&encoded)?;
+                let seconds = Seconds { write: seconds.write + start.elapsed().as_secs_f64(), ..seconds };
+                observe(Event::Frame { record: *encoded.record(), seconds: Some(seconds) });
+                encoded
+            }
+        };
+        let first_error = before.as_ref().map_or(encoded.record().fit_error, |b| b.first_error);
+        before = Some(Before { gaussians: encoded.decode_gaussians(output)?, first_error });
+    }
+    let sequence = SequenceRecord {
+        world_from_index: survey.world_from_index.to_cols_array(),
+        origin: survey.origin,
+        dims: survey.dims,
+        density_max: survey.density_max,
+        promise,
+        frames_per_second: settings.frames_per_second,
+        name: settings.name.clone(),
+        grid: survey.grid.clone(),
+    };
+    assemble(survey, settings, settings_json, &sequence, &work, observe)?;
+    work.finish(output)
+}
+
+/// What a later frame needs of the ones before it.
+struct Before {
+    gaussians: Vec<Gaussian>,
+    first_error: f64,
+}
+
+#[expect(clippy::too_many_arguments, reason = "one call; the frame's own part of `bake`")]
+fn bake_frame(
+    survey: &Survey,
+    frame: &SurveyedFrame,
+    space: &UnitSpace,
+    settings: &BakeSettings,
+    target: Target,
+    before: Option<&Before>,
+    output: &Path,
+    observe: &mut dyn FnMut(Event),
+) -> Result<(EncodedFrame, Seconds)> {
+    let mut clock = Clock(Instant::now());
+    let mut seconds = Seconds::default();
+    if hash_file(&frame.path)? != frame.source_hash {
+        return Err(Error::Changed { path: frame.path.clone() });
+    }
+    let (density, _) = read_density(&frame.path, &survey.grid, survey.clamp)?;
+    seconds.read = clock.lap();
+
+    let mut progress = |progress| observe(Event::Fit { frame: frame.number, progress });
+    let fit = match before {
+        None => fit_first(&density, space, &settings.fit, &mut progress),
+        Some(b) => fit_next(&density, space, &b.gaussians, b.first_error, &settings.fit, &mut progress),
+    };
+    let Fit { gaussians, .. } = fit.map_err(|source| Error::Fit { path: frame.path.clone(), source })?;
+    seconds.fit = clock.lap();
+
+    // Rounded to what the pack stores, in its order, before the residual is taken against them.
+    let gaussians = pack::snap_gaussians(output, &gaussians)?;
+    let sum = gaussian_sum(&gaussians, space, density.origin, density.dims);
+    let quantised = quantise(&density, &sum, target);
+    let quantised = quantised.map_err(|source| Error::Quantise { path: frame.path.clone(), source })?;
+    let record = FrameRecord {
+        frame: frame.number,
+        fit_error: fit_error(&density, &sum),
+        max_error: quantised.max_error,
+        psnr_db: quantised.psnr_db,
+        step: quantised.step,
+        source_hash: frame.source_hash,
+        ..FrameRecord::default()
+    };
+    seconds.residual = clock.lap();
+
+    let data = FrameData { record, gaussians: &gaussians, codes: &quantised.codes };
+    let encoded = EncodedFrame::new(output, &data, settings.at_rest)?;
+    seconds.write = clock.lap();
+    Ok((encoded, seconds))
+}
+
+/// `sum (D - S)^2 / sum D^2` over all voxels of the frame's box; 0 for an empty one.
+fn fit_error(density: &DensityGrid, sum: &[f32]) -> f64 {
+    let pairs = density.values.iter().zip(sum);
+    let (error, energy) = pairs.fold((0.0, 0.0), |(error, energy), (&d, &s)| {
+        let (d, e) = (f64::from(d), f64::from(d) - f64::from(s));
+        (error + e * e, energy + d * d)
+    });
+    if energy > 0.0 { error / energy } else { 0.0 }
+}
+
+/// Puts the pack together, tile by tile.
+fn assemble(
+    survey: &Survey,
+    settings: &BakeSettings,
+    settings_json: &str,
+    sequence: &SequenceRecord,
+    work: &Work,
+    observe: &mut dyn FnMut(Event),
+) -> Result<()> {
+    let path = work.pack_file();
+    let mut failed = None;
+    let written = pack::write(&path, |mut writer| {
+        for tile in survey.frames.chunks(MAX_FRAMES) {
+            let start = Instant::now();
+            let mut frames = vec![];
+            for frame in tile {
+                match work.load(frame.number) {
+                    Some(encoded) => frames.push(encoded),
+                    None => {
+                        failed = Some(Error::Changed { path: Work::folder_of(&path) });
+                        return Err(smoke_formats::Error::invalid(&path, "work", "a frame lost", "all frames"));
+                    }
+                }
+            }
+            match lay_out(&path, &mut frames, settings)? {
+                None => frames.iter().try_for_each(|frame| writer.push_encoded(frame))?,
+                Some((table, codes)) => {
+                    let gaussians =
+                        frames.iter().map(|f| f.decode_gaussians(&path)).collect::<smoke_formats::Result<Vec<_>>>()?;
+                    let data = |i: usize| FrameData {
+                        record: *frames[i].record(),
+                        gaussians: &gaussians[i],
+                        codes: &codes[i],
+                    };
+                    let tile: Vec<FrameData> = (0..frames.len()).map(data).collect();
+                    writer.push_tile(&tile, &table, settings.at_rest)?;
+                }
+            }
+            let seconds = start.elapsed().as_secs_f64();
+            observe(Event::Tile { frames: tile.iter().map(|f| f.number).collect(), seconds });
+        }
+        writer.finish(sequence, &SettingsRecord { json: settings_json.to_owned() })
+    });
+    match failed {
+        Some(error) => Err(error),
+        None => Ok(written.map(drop)?),
+    }
+}
+
+/// The hash of a tile and its codes, where it is wanted or smaller; none for ranks, which lie ready.
+fn lay_out(
+    path: &Path,
+    frames: &mut [EncodedFrame],
+    settings: &BakeSettings,
+) -> smoke_formats::Result<Option<(HashTable, Vec<ResidualCodes>)>> {
+    if settings.residual == ResidualMode::Rank {
+        return Ok(None);
+    }
+    let codes = frames.par_iter().map(|f| f.codes(path)).collect::<smoke_formats::Result<Vec<_>>>()?;
+    let layout = choose(path, &codes, settings.residual, settings.seed)?;
+    if let Some(bytes) = layout.hash_bytes {
+        let share = bytes / frames.len() as u64;
+        frames.iter_mut().for_each(|frame| frame.set_hash_bytes(share));
+    }
+    Ok(layout.hash.map(|table| (table, codes)))
+}
+
+/// Text that is the same exactly when the same bake would give the same pack.
+fn fingerprint(survey: &Survey, settings_json: &str) -> String {
+    let hex = |hash: &[u8; 16]| hash.iter().map(|b| format!("{b:02x}")).collect::<String>();
+    let frames: Vec<String> = survey.frames.iter().map(|f| format!("{} {}", f.number, hex(&f.source_hash))).collect();
+    let version = env!("CARGO_PKG_VERSION");
+    format!("smoke-bake {version}\n{settings_json}\n{}\nclamp {}\n{}\n", survey.grid, survey.clamp, frames.join("\n"))
+}
+
+/// Time since the last lap.
+struct Clock(Instant);
+
+impl Clock {
+    fn lap(&mut self) -> f64 {
+        let now = Instant::now();
+        let seconds = now.duration_since(self.0).as_secs_f64();
+        self.0 = now;
+        seconds
+    }
+}
