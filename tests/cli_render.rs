@@ -1,0 +1,148 @@
+//! `render` through the binary: the shipped plume under the shipped scenes; same bytes alone, in a sequence and with any
+//! number of threads; dials, names and bad input.
+
+mod common;
+
+use common::{answer, refusal, smoke_bake, text};
+use serde_json::Value;
+use smoke_formats::image::{self, FloatImage};
+use std::path::Path;
+use std::sync::LazyLock;
+
+const SUNSET: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/testdata/scenes/sunset.toml");
+const SUN: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/testdata/scenes/sun.toml");
+const TURNED: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/testdata/scenes/turned.toml");
+
+/// A folder with three frames of the shipped plume as `plume.smoke`.
+static BAKED: LazyLock<tempfile::TempDir> = LazyLock::new(|| {
+    let folder = tempfile::tempdir().unwrap();
+    let fit = ["--gaussians", "40", "--first-evaluations", "20", "--next-evaluations", "6", "--max-error", "0.004"];
+    let line = ["bake", common::PLUME, "-o", "plume.smoke", "--frames", "6-8", "--progress", "none"];
+    answer(folder.path(), &[&line[..], &fit].concat());
+    folder
+});
+
+/// Renders into a folder of its own; small images.
+fn render(scene: &str, output: &str, more: &[&str]) -> (tempfile::TempDir, String) {
+    let folder = tempfile::tempdir().unwrap();
+    let pack = BAKED.path().join("plume.smoke");
+    let line = ["render", pack.to_str().unwrap(), "--scene", scene, "-o", output, "--progress", "none"];
+    let said = answer(folder.path(), &[&line[..], &["--width", "60", "--height", "48"], more].concat());
+    (folder, said)
+}
+
+fn refused(scene: &str, output: &str, more: &[&str]) -> (Option<i32>, String) {
+    let folder = tempfile::tempdir().unwrap();
+    let pack = BAKED.path().join("plume.smoke");
+    let line = ["render", pack.to_str().unwrap(), "--scene", scene, "-o", output, "--progress", "none"];
+    let output = smoke_bake(folder.path(), &[&line[..], more].concat());
+    assert!(std::fs::read_dir(folder.path()).unwrap().next().is_none(), "{more:?}: nothing may be left behind");
+    (output.status.code(), text(&output.stderr).to_owned())
+}
+
+fn read(folder: &Path, name: &str) -> FloatImage {
+    image::read(&folder.join(name)).unwrap()
+}
+
+#[test]
+fn a_frame_alone_in_a_sequence_and_on_any_number_of_threads_has_the_same_bytes() {
+    for dials in [&["--g", "0.7"][..], &["--route", "centres"], &["--order", "single", "--samples", "2"]] {
+        let (all, _) = render(SUNSET, "out.####.exr", &[dials, &["--threads", "1"]].concat());
+        let (one, _) = render(SUNSET, "out.%04d.exr", &[dials, &["--threads", "3", "--frames", "8"]].concat());
+        let bytes = |folder: &Path, name: &str| std::fs::read(folder.join(name)).unwrap();
+        assert!(bytes(all.path(), "out.0008.exr") == bytes(one.path(), "out.0008.exr"), "{dials:?}");
+        assert!(bytes(all.path(), "out.0008.exr") != bytes(all.path(), "out.0007.exr"));
+        assert!(!one.path().join("out.0007.exr").exists());
+    }
+}
+
+#[test]
+fn images_hold_smoke_depth_and_every_setting() {
+    let (folder, said) = render(SUNSET, "out.$F4.exr", &["--frames", "7", "--json", "--float", "--sigma-t", "9,8,7"]);
+    let image = read(folder.path(), "out.0007.exr");
+    let channel = |name: &str| image.channel(name).unwrap();
+    assert_eq!((image.width, image.height, image.channels.len()), (60, 48, 5));
+    let covered: Vec<usize> = (0..60 * 48).filter(|&p| channel("A")[p] > 0.5).collect();
+    assert!(covered.len() > 20, "{} pixels of smoke", covered.len());
+    for p in 0..60 * 48 {
+        assert_eq!(channel("A")[p] == 0.0 && channel("R")[p] == 0.0, channel("Z")[p].is_infinite(), "pixel {p}");
+    }
+    assert!(covered.iter().all(|&p| channel("G")[p] > 0.01 && channel("Z")[p] > 0.1));
+    let json: Value = serde_json::from_str(&said).unwrap();
+    assert_eq!(json["settings"]["scene"]["medium"]["sigma_t"].to_string(), "[9.0,8.0,7.0]");
+    assert_eq!(json["settings"]["render"]["route"], "grid");
+    assert_eq!((json["frames"][0]["frame"].as_i64(), json["width"].as_i64()), (Some(7), Some(60)));
+    for stage in ["decode", "source_radiance", "volume_pass", "view_pass", "write"] {
+        assert!(json["frames"][0]["seconds"][stage].as_f64().unwrap() > 0.0, "{stage}");
+    }
+    let bytes = std::fs::read(folder.path().join("out.0007.exr")).unwrap();
+    let has = |text: &str| bytes.windows(text.len()).any(|w| w == text.as_bytes());
+    assert!(has("smokebake:settings") && has("\"beams\":96") && has("\"sigma_t\":[9.0,8.0,7.0]") && has("\"frame\":7"));
+}
+
+#[test]
+fn every_dial_changes_the_image_and_a_scene_may_have_y_up() {
+    let picture = |scene: &str, dials: &[&str]| {
+        let (folder, _) = render(scene, "out.exr", &[&["--frames", "8", "--float"], dials].concat());
+        read(folder.path(), "out.exr")
+    };
+    let default = picture(SUNSET, &["--g", "0.4"]);
+    for dials in [
+        &["--route", "centres"][..],
+        &["--route", "centres", "--exponential", "linear"],
+        &["--route", "centres", "--multiple", "diffusion"],
+        &["--order", "single"],
+        &["--sh-order", "2"],
+        &["--beams", "12"],
+        &["--source-step", "2"],
+        &["--scatter-step", "3"],
+        &["--march-step", "1"],
+        &["--cutoff", "0.2"],
+        &["--samples", "2"],
+        &["--albedo", "0.5"],
+    ] {
+        assert!(picture(SUNSET, &[&["--g", "0.4"], dials].concat()) != default, "{dials:?}");
+    }
+    for scene in [SUN, TURNED] {
+        let image = picture(scene, &[]);
+        assert!(image.channel("R").unwrap().iter().any(|&r| r > 0.01), "{scene}");
+    }
+}
+
+#[test]
+fn options_that_do_not_apply_are_wrong_usage_and_not_ignored() {
+    for (dials, named) in [
+        (&["--exponential", "direct"][..], "--exponential"),
+        (&["--multiple", "diffusion"], "--multiple"),
+        (&["--route", "centres", "--beams", "5"], "--beams"),
+        (&["--route", "centres", "--scatter-step", "2"], "--scatter-step"),
+        (&["--route", "centres", "--multiple", "transport"], "--multiple"),
+        (&["--order", "single", "--multiple", "transport"], "--multiple"),
+        (&["--order", "single", "--scatter-step", "2"], "--scatter-step"),
+        (&["--march-step", "5"], "--march-step"),
+        (&["--cutoff", "1"], "--cutoff"),
+        (&["--samples", "0"], "--samples"),
+    ] {
+        let (code, message) = refused(SUNSET, "out.####.exr", dials);
+        assert_eq!(code, Some(2), "{dials:?}: {message}");
+        assert!(message.contains(named), "{message}");
+    }
+    assert_eq!(refused(SUNSET, "out.png", &[]).0, Some(2));
+}
+
+#[test]
+fn several_frames_with_one_name_a_missing_frame_and_a_point_light_are_refused() {
+    let (code, message) = refused(SUNSET, "out.exr", &[]);
+    assert!(code == Some(1) && message.contains("one name for 3 frames"), "{message}");
+    let (code, message) = refused(SUNSET, "out.####.exr", &["--frames", "9"]);
+    assert!(code == Some(1) && message.contains("frame 9"), "{message}");
+    let (code, message) = refused(SUNSET, "out.####.exr", &["--g", "1"]);
+    assert!(code == Some(1) && message.contains("medium.g"), "{message}");
+    let folder = tempfile::tempdir().unwrap();
+    let point = "\n[[light]]\nkind = \"point\"\nposition = [0, 0, 1]\nintensity = 10\n";
+    std::fs::write(folder.path().join("scene.toml"), std::fs::read_to_string(SUN).unwrap() + point).unwrap();
+    let pack = BAKED.path().join("plume.smoke");
+    let line = ["render", pack.to_str().unwrap(), "--scene", "scene.toml", "-o", "a.####.exr", "--progress", "none"];
+    let message = refusal(folder.path(), &line);
+    assert!(message.contains("light[") && message.contains("point"), "{message}");
+}
