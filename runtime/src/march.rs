@@ -216,7 +216,8 @@ fn march_row(view: &View, y: usize, row: &mut [Pixel]) {
             (0..3).for_each(|c| transmittance[c] += seen.transmittance[c]);
             depth = depth.min(seen.depth);
         }
-        *pixel = Pixel { radiance: radiance.map(|r| r * share), transmittance: transmittance.map(|t| t * share), depth };
+        *pixel =
+            Pixel { radiance: radiance.map(|r| r * share), transmittance: transmittance.map(|t| t * share), depth };
     }
 }
 
@@ -250,7 +251,8 @@ struct Ray {
 #[inline(always)]
 fn march_ray(volume: &ShadedVolume, ray: &Ray, sigma_t: [f32; 3], cutoff: f32) -> Pixel {
     let Some((near, far)) = volume.span(ray.origin, ray.direction) else { return Pixel::EMPTY };
-    let optics = Optics { sigma_t, grey: sigma_t[0] == sigma_t[1] && sigma_t[0] == sigma_t[2], cutoff, ds: ray.ds as f32 };
+    let optics =
+        Optics { sigma_t, grey: sigma_t[0] == sigma_t[1] && sigma_t[0] == sigma_t[2], cutoff, ds: ray.ds as f32 };
     let mut state = State { radiance: Vec4::ZERO, transmittance: Vec4::ONE, first: f64::INFINITY };
     let mut samples = Samples::default();
     let inside = ray.origin + ray.direction * (near + 1e-6 * ray.ds);

@@ -102,7 +102,8 @@ fn a_camera_inside_the_smoke_sees_it_all_round_and_from_the_eye_on() {
         for forward in [DVec3::X, DVec3::NEG_X, DVec3::Y, DVec3::NEG_Z] {
             let eye = DVec3::new(0.05, -0.03, 0.02);
             let inside = Camera::look_at(eye, eye + forward, DVec3::new(0.3, 0.5, 0.7), 70.0, 12, 12);
-            let film = render(settings, frame([20; 3], 0.1, 1.0, &lumps(), |_| 0.0), grey(4.0, 0.9, 0.3), white(), &inside);
+            let film =
+                render(settings, frame([20; 3], 0.1, 1.0, &lumps(), |_| 0.0), grey(4.0, 0.9, 0.3), white(), &inside);
             sound(&film, 1.1, "inside");
             // Density begins at the eye: the first sample is half a step (a quarter voxel) away.
             assert!(film.pixels.iter().all(|p| p.alpha() > 0.2 && p.depth <= 0.026), "{forward}");
@@ -144,7 +145,10 @@ fn units_from_a_millionth_to_a_million_give_the_same_image_when_extinction_scale
                 for c in 0..3 {
                     // Lengths are rounded to f32 once or twice on the way: 1e-7 of the depth, times a depth of 16; and
                     // a sample may fall on the other side of a brick's face.
-                    assert!((a.radiance[c] - b.radiance[c]).abs() < 1e-4 * b.radiance[c].max(0.01), "{voxel} {a:?} {b:?}");
+                    assert!(
+                        (a.radiance[c] - b.radiance[c]).abs() < 1e-4 * b.radiance[c].max(0.01),
+                        "{voxel} {a:?} {b:?}"
+                    );
                     assert!((a.transmittance[c] - b.transmittance[c]).abs() < 1e-5, "{voxel}");
                 }
                 let depth = f64::from(a.depth) / voxel * 0.1;
@@ -176,7 +180,9 @@ fn a_slab_of_constant_density_scatters_once_by_its_closed_form() {
 
 #[test]
 fn densities_of_sixteen_bit_range_render_as_those_of_one_when_extinction_scales_inversely() {
-    let of = |unit: f32| render(RenderSettings::default(), ball(0.1, unit), grey(8.0 / unit, 0.9, 0.5), white(), &camera(4.0));
+    let of = |unit: f32| {
+        render(RenderSettings::default(), ball(0.1, unit), grey(8.0 / unit, 0.9, 0.5), white(), &camera(4.0))
+    };
     let expected = of(1.0);
     for unit in [1e-6, 65535.0, 1e6] {
         for (a, b) in of(unit).pixels.iter().zip(&expected.pixels) {
@@ -211,7 +217,13 @@ fn one_gaussian_and_coincident_gaussians_are_finite_and_agree() {
         for multiple in [MultipleScattering::IntegralCentres, MultipleScattering::Diffusion] {
             let settings = centres(exponential, multiple);
             let of = |gaussians: &[Gaussian]| {
-                render(settings, frame([20; 3], 0.1, 1.0, gaussians, |_| 0.0), grey(3.0, 0.9, 0.3), white(), &camera(4.0))
+                render(
+                    settings,
+                    frame([20; 3], 0.1, 1.0, gaussians, |_| 0.0),
+                    grey(3.0, 0.9, 0.3),
+                    white(),
+                    &camera(4.0),
+                )
             };
             let (single, twice) = (of(&[one]), of(&[half, half]));
             sound(&single, 1.1, "one");
@@ -337,7 +349,8 @@ fn what_a_route_or_a_dial_cannot_serve_is_refused_by_name() {
 #[test]
 fn a_turned_and_mirrored_placement_changes_nothing_when_lights_and_camera_turn_with_it() {
     let turn = DAffine3::from_mat3(
-        glam::DMat3::from_rotation_z(std::f64::consts::FRAC_PI_2) * glam::DMat3::from_diagonal(DVec3::new(1.0, 1.0, -1.0)),
+        glam::DMat3::from_rotation_z(std::f64::consts::FRAC_PI_2)
+            * glam::DMat3::from_diagonal(DVec3::new(1.0, 1.0, -1.0)),
     );
     let settings = centres(Exponential::Direct, MultipleScattering::IntegralCentres);
     let place = |turned: bool| {
