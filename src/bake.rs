@@ -103,6 +103,7 @@ fn settings(args: &BakeArgs, name: String) -> BakeSettings {
             AtRest::Compressed => pack::AtRest::SMALLEST,
             AtRest::Raw => pack::AtRest::RAW,
         },
+        key_every: args.key_every as usize,
         frames_per_second: args.fps,
         seed: args.seed,
     }
@@ -122,6 +123,7 @@ fn settings_json(args: &BakeArgs, settings: &BakeSettings, survey: &Survey) -> S
         "promise": promise,
         "residual": settings.residual,
         "at_rest": if args.at_rest == AtRest::Raw { "raw" } else { "compressed" },
+        "key_every": settings.key_every,
         "frames_per_second": settings.frames_per_second,
         "seed": settings.seed,
     })

@@ -229,6 +229,9 @@ pub struct BakeArgs {
     /// Sections compressed, or raw for mapping.
     #[arg(long, value_enum, default_value_t)]
     pub at_rest: AtRest,
+    /// Every N-th frame can be read alone; those between are smaller, and need the ones before them back to there.
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64))]
+    pub key_every: u32,
     /// Replace negative and non-finite densities by zero, and report them, instead of stopping.
     #[arg(long)]
     pub clamp: bool,

@@ -44,7 +44,7 @@ const BAKE: [&str; 2] = ["--fps", "8"];
 /// The last frame in other lights and media: name, scene, further options of `render`.
 const RELIT: [(&str, &str, &[&str]); 4] = [
     ("turned", "turned.toml", &[]),
-    ("thin", "turned.toml", &["--sigma-t", "6", "--g", "0.7"]),
+    ("thin", "sunset.toml", &["--sigma-t", "6", "--g", "0.7"]),
     ("sun", "sun.toml", &[]),
     ("thick", "sun.toml", &["--sigma-t", "120"]),
 ];

@@ -1,8 +1,8 @@
 //! `smoke-bake unpack PACK -o PATTERN`: the frames of a pack as OpenVDB or Mitsuba volumes.
 //!
 //! A voxel gets the value of the decoder that `render` uses, on the box of the frame; active is the stored support, and
-//! the map is the source's. Float is the default: the promised error holds as it is. Half floats move each value by up to
-//! 2^-12 of itself more (2^-11 between two neighbours), which is measured and reported, never silent.
+//! the map is the source's. Float is the default: the promised error holds as it is. Half floats move a value by at
+//! most 2^-11 of itself more, which is measured and reported, never silent.
 //! Cost: decoding; frames run in parallel, one box each in memory.
 
 use crate::cli::UnpackArgs;

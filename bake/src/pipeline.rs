@@ -4,7 +4,7 @@
 //! already written: an interrupted one goes on from its work folder and ends with the same bytes.
 //! Memory: one frame, and the codes of one tile of 27 frames where a hash is to be tried.
 
-use crate::fit::frame::{Fit, FitProgress, FitSettings, fit_first, fit_next};
+use crate::fit::frame::{Fit, FitProgress, FitSettings, fit_first, fit_next, reference_error};
 use crate::residual::quantise::{Target, quantise};
 use crate::residual::tile::{ResidualMode, choose};
 use crate::survey::{Survey, SurveyedFrame, hash_file, read_density};
@@ -35,6 +35,8 @@ pub struct BakeSettings {
     pub residual: ResidualMode,
     /// Sections coded, or raw to be mapped.
     pub at_rest: AtRest,
+    /// Every how many frames one stands alone at rest; those between are coded after the one before. 1 to 64.
+    pub key_every: usize,
     /// Frames a second, if known.
     pub frames_per_second: Option<f64>,
     /// Seed of the search for hashes.
@@ -109,15 +111,29 @@ pub fn bake(
         Promise::Psnr(db) => Target::Psnr { db, peak: survey.density_max },
     };
     let mut before: Option<Before> = None;
-    for frame in &survey.frames {
+    for (number, frame) in survey.frames.iter().enumerate() {
+        // What lies at rest after the frame before needs that frame's codes; a key frame needs none.
+        let codes_before = match &before {
+            Some(b) if number % settings.key_every != 0 => Some(b.encoded.codes(output)?),
+            _ => None,
+        };
         let encoded = match work.load(frame.number) {
             Some(done) => {
                 observe(Event::Frame { record: *done.record(), seconds: None });
                 done
             }
             None => {
-                let (encoded, seconds) =
-                    bake_frame(survey, frame, &space, settings, target, before.as_ref(), output, observe)?;
+                let (encoded, seconds) = bake_frame(
+                    survey,
+                    frame,
+                    &space,
+                    settings,
+                    target,
+                    before.as_ref(),
+                    codes_before,
+                    output,
+                    observe,
+                )?;
                 let start = Instant::now();
                 work.store(&encoded)?;
                 let seconds = Seconds { write: seconds.write + start.elapsed().as_secs_f64(), ..seconds };
@@ -125,8 +141,9 @@ pub fn bake(
                 encoded
             }
         };
-        let first_error = before.as_ref().map_or(encoded.record().fit_error, |b| b.first_error);
-        before = Some(Before { gaussians: encoded.decode_gaussians(output)?, first_error });
+        let least = before.as_ref().map_or(f64::INFINITY, |b| b.reference);
+        let reference = reference_error(least, encoded.record().fit_error);
+        before = Some(Before { gaussians: encoded.decode_gaussians(output)?, reference, encoded });
     }
     let sequence = SequenceRecord {
         world_from_index: survey.world_from_index.to_cols_array(),
@@ -145,7 +162,9 @@ pub fn bake(
 /// What a later frame needs of the ones before it.
 struct Before {
     gaussians: Vec<Gaussian>,
-    first_error: f64,
+    /// The error that the rule for insertions compares with.
+    reference: f64,
+    encoded: EncodedFrame,
 }
 
 #[expect(clippy::too_many_arguments, reason = "one call; the frame's own part of `bake`")]
@@ -156,6 +175,7 @@ fn bake_frame(
     settings: &BakeSettings,
     target: Target,
     before: Option<&Before>,
+    codes_before: Option<ResidualCodes>,
     output: &Path,
     observe: &mut dyn FnMut(Event),
 ) -> Result<(EncodedFrame, Seconds)> {
@@ -170,7 +190,7 @@ fn bake_frame(
     let mut progress = |progress| observe(Event::Fit { frame: frame.number, progress });
     let fit = match before {
         None => fit_first(&density, space, &settings.fit, &mut progress),
-        Some(b) => fit_next(&density, space, &b.gaussians, b.first_error, &settings.fit, &mut progress),
+        Some(b) => fit_next(&density, space, &b.gaussians, b.reference, &settings.fit, &mut progress),
     };
     let Fit { gaussians, .. } = fit.map_err(|source| Error::Fit { path: frame.path.clone(), source })?;
     seconds.fit = clock.lap();
@@ -192,7 +212,7 @@ fn bake_frame(
     seconds.residual = clock.lap();
 
     let data = FrameData { record, gaussians: &gaussians, codes: &quantised.codes };
-    let encoded = EncodedFrame::new(output, &data, settings.at_rest)?;
+    let encoded = EncodedFrame::new(output, &data, settings.at_rest, codes_before.as_ref())?;
     seconds.write = clock.lap();
     Ok((encoded, seconds))
 }

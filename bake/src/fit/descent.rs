@@ -89,7 +89,7 @@ impl<'a> Descent<'a> {
         let (lower, upper) = bounds.scaled(&units);
         let solver = Lbfgsb::new(lower, upper, memory)?
             .gradient_tolerance(1e-9)
-            .cost_tolerance(tolerance)
+            .cost_tolerance(tolerance, 0.0)
             .max_evaluations(evaluations)
             .first_step(0.5);
         let mut new = Self {
@@ -130,7 +130,7 @@ impl<'a> Descent<'a> {
             if gradient.is_empty() { s } else { s.gradient(gradient).cost(self.cost) }
         });
         let mut result = executor.run()?;
-        self.finished = iterations > 0 && result.state.iter < iterations;
+        self.finished = result.solver.finished();
         self.iterations += result.state.iter;
         self.cost = result.state.cost;
         let z = result.state.take_param().unwrap_or_default();
@@ -202,5 +202,89 @@ impl<'a> Descent<'a> {
         let ratio: Vec<f64> = old.iter().zip(&self.units).map(|(old, new)| old / new).collect();
         let (lower, upper) = self.bounds.scaled(&self.units);
         self.solver.rescale(&ratio, lower, upper);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fit::initial::initial;
+    use crate::fit::objective::Scope;
+    use smoke_formats::gaussian::UnitSpace;
+    use smoke_formats::volume::{DensityGrid, VoxelMask};
+
+    const BOUNDS: Bounds = Bounds { radius: [0.03, 0.1], weight: [0.05, 0.9] };
+
+    /// A ball of radius 8 in 24 voxels, dense at its rim, and where a fit of it starts.
+    fn ball() -> (Objective, Vec<f64>) {
+        let side = 24usize;
+        let value = |v: usize| {
+            let square: f32 =
+                [v % side, v / side % side, v / (side * side)].map(|i| (i as f32 - 11.5).powi(2)).iter().sum();
+            if square < 64.0 { 0.3 + square / 100.0 } else { 0.0 }
+        };
+        let values: Vec<f32> = (0..side.pow(3)).map(value).collect();
+        let (active, name) = (VoxelMask::new(values.len()), "density".to_owned());
+        let world_from_index = Default::default();
+        let grid = DensityGrid { name, origin: [0; 3], dims: [side; 3], values, active, world_from_index };
+        let objective = Objective::new(&grid, &UnitSpace::of_box([0; 3], [side as u32; 3]), Scope::Box).unwrap();
+        let x = initial(&grid, &objective, 12, &BOUNDS);
+        (objective, x)
+    }
+
+    #[test]
+    fn the_cost_is_that_of_the_variables_after_every_step_and_change() {
+        let (objective, x) = ball();
+        let mut descent = Descent::new(&objective, x, BOUNDS, 10, 0.0, 500).unwrap();
+        let (mut last, mut evaluations) = (descent.cost, descent.evaluations());
+        assert_eq!(evaluations, 1);
+        for round in 0..6 {
+            descent.advance(5).unwrap();
+            match round {
+                1 | 4 => descent.rescale(),
+                2 => assert!(descent.try_insert(&[[0.5, 0.5, 0.2, 0.05, 0.2]])),
+                3 => {
+                    let mut x = descent.x.clone();
+                    x[4] *= 0.99;
+                    let before = (descent.cost, descent.x.clone());
+                    let moved = descent.try_move(x, &[0]);
+                    assert!(moved == (descent.cost < before.0) && (moved || descent.x == before.1));
+                }
+                _ => (),
+            }
+            assert!(descent.cost <= last && descent.evaluations() > evaluations);
+            (last, evaluations) = (descent.cost, descent.evaluations());
+            // Units are divided out and multiplied in again: a few rounding steps of f64, of which f32 sees little.
+            let again = objective.cost_gradient(&descent.x, &mut vec![0.0; descent.x.len()]);
+            assert!((again / last - 1.0).abs() < 1e-6, "{again} {last}");
+            for g in descent.x.chunks(VARIABLES) {
+                assert_eq!((g[3], g[4]), (BOUNDS.radius(g[3]), BOUNDS.weight(g[4])));
+            }
+        }
+        assert_eq!(descent.x.len(), 13 * VARIABLES);
+    }
+
+    #[test]
+    fn it_ends_at_the_limit_of_evaluations_and_goes_on_when_more_are_allowed() {
+        let (objective, x) = ball();
+        let mut descent = Descent::new(&objective, x, BOUNDS, 10, 0.0, 10).unwrap();
+        assert!(!descent.advance(100).unwrap());
+        let (evaluations, cost) = (descent.evaluations(), descent.cost);
+        // An iteration that has begun is finished: at most 20 evaluations of a line search.
+        assert!((10..30).contains(&evaluations));
+        assert!(!descent.advance(100).unwrap());
+        assert_eq!(descent.evaluations(), evaluations);
+        descent.allow(10);
+        descent.advance(100).unwrap();
+        assert!(descent.evaluations() > evaluations && descent.cost < cost);
+    }
+
+    #[test]
+    fn a_gaussian_that_does_not_help_is_not_inserted() {
+        let (objective, x) = ball();
+        let mut descent = Descent::new(&objective, x, BOUNDS, 10, 0.0, 10).unwrap();
+        let (x, cost) = (descent.x.clone(), descent.cost);
+        assert!(!descent.try_insert(&[[0.05, 0.05, 0.05, 0.1, 0.9]]));
+        assert_eq!((descent.x, descent.cost), (x, cost));
     }
 }

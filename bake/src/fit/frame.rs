@@ -1,12 +1,13 @@
 //! The fit of one frame: the first in full, each later one from the one before it.
 //!
 //! First frame: spread Gaussians over the density ([`initial`](super::initial)), minimise, and exchange useless
-//! Gaussians for needed ones every few iterations ([`teleport`](super::teleport)). Later frames (Zhou et al. 2008,
+//! Gaussians for needed ones every few iterations ([`teleport`]). Later frames (Zhou et al. 2008,
 //! section 5.1): start from the frame before, delete the 3 of least integral, minimise; while the error is more than
 //! `error_ratio` times that of the first frame, insert Gaussians where density is missing and minimise again, at most
 //! 8 in all. Where we deviate: insertions go by expected gain, half of what is left of the 8 at a time, which takes
-//! four rounds instead of eight; and the number of Gaussians is held ([`FitSettings::steady`]): over the 64 frames of a
-//! plume the mean error is .0449 instead of .0512 at the same evaluations (docs/decisions/023-fit-sequence.md).
+//! four rounds instead of eight; they compare with the least error so far ([`reference_error`]); and by default the
+//! number of Gaussians is held instead ([`FitSettings::steady`]): over the 64 frames of a plume the mean error is .0449
+//! instead of .0512 at the same evaluations (docs/decisions/023-fit-sequence.md).
 
 use super::descent::{Bounds, Descent};
 use super::initial::initial;
@@ -18,8 +19,11 @@ use smoke_formats::volume::DensityGrid;
 /// Occupied voxels that one Gaussian must stand for: below, its ten bytes are better spent on the residual.
 const VOXELS_PER_GAUSSIAN: usize = 10;
 
-/// The first frame's error is taken for at least this where it is compared with (a perfect first frame allows none).
-const LEAST_FIRST_ERROR: f64 = 1e-6;
+/// The reference error is taken for at least this (a perfect frame allows no error at all).
+const LEAST_REFERENCE: f64 = 1e-6;
+
+/// A later frame that may hold more than this many times its Gaussians is fitted as a first one.
+const GROWTH: usize = 2;
 
 /// What radii and weights may be at all: their cubes and squares stay far from the limits of f32.
 pub const BOUND_LIMITS: [f64; 2] = [1e-6, 1e6];
@@ -55,12 +59,12 @@ pub struct FitSettings {
     pub teleport_rule: Rule,
     /// Gaussians deleted at the start of a later frame.
     pub deletions: usize,
-    /// Gaussians inserted in a later frame, at most.
+    /// Gaussians inserted in a later frame, at most, where the number is not held.
     pub insertions: usize,
-    /// Error over the first frame's above which Gaussians are inserted, at least 1 (the paper: 1.05 to 1.2).
+    /// Error over the reference error above which Gaussians are inserted, at least 1 (the paper: 1.05 to 1.2).
     pub error_ratio: f64,
-    /// Later frames are filled up to `gaussians` again (at most `insertions` a frame), and teleport once; false: the
-    /// paper's rule, which without insertions loses `deletions` a frame.
+    /// The number is held: later frames are filled up to `gaussians` again, and teleport once. False: the paper's rule,
+    /// which deletes, and inserts where the error has grown.
     pub steady: bool,
     /// The voxels that count.
     pub scope: Scope,
@@ -215,8 +219,18 @@ pub fn fit_first(
     optimise().map_err(|e| FitError::Optimiser { grid: grid.name.clone(), message: e.to_string() })
 }
 
-/// Fits a frame that follows another. `previous` are that frame's Gaussians (as they lie in the pack), `first_error`
-/// the [`Fit::fit_error`] of the sequence's first frame.
+/// The error that later frames are compared with: the least of all frames before; `before` starts as infinity.
+///
+/// The paper takes the first frame's. A sequence that begins with a puff much smaller than its box has a large error
+/// there, and its rule would never insert. Frames without density, whose error is 0, do not count.
+pub fn reference_error(before: f64, fit_error: f64) -> f64 {
+    if fit_error > 0.0 { before.min(fit_error) } else { before }
+}
+
+/// Fits a frame that follows another. `previous` are that frame's Gaussians (as they lie in the pack), `reference` is
+/// the [`reference_error`] of the frames before (it matters only where the number is not held).
+///
+/// A frame that may hold more than twice as many Gaussians as are left of the frame before is fitted as a first one.
 ///
 /// # Errors
 /// As [`fit_first`].
@@ -224,7 +238,7 @@ pub fn fit_next(
     grid: &DensityGrid,
     space: &UnitSpace,
     previous: &[Gaussian],
-    first_error: f64,
+    reference: f64,
     settings: &FitSettings,
     progress: &mut dyn FnMut(FitProgress),
 ) -> Result<Fit, FitError> {
@@ -234,7 +248,8 @@ pub fn fit_next(
     let mut x = merged(variables(previous, objective.peak(), &bounds), &bounds);
     let keep = (x.len() / VARIABLES).saturating_sub(settings.deletions).min(affordable);
     retain_largest(&mut x, keep);
-    if x.is_empty() {
+    let wanted = if settings.steady { settings.gaussians.min(affordable) } else { keep };
+    if x.is_empty() || wanted > GROWTH * (x.len() / VARIABLES) {
         return fit_first(grid, space, settings, progress);
     }
     let optimise = || -> Result<Fit, argmin::core::Error> {
@@ -243,8 +258,7 @@ pub fn fit_next(
         let mut descent = Descent::new(&objective, x, bounds, settings.memory, settings.tolerance, most)?;
         let mut fit = Fit { deleted, ..Fit::default() };
         if settings.steady {
-            let n = settings.gaussians.min(affordable);
-            let missing = n.saturating_sub(descent.x.len() / VARIABLES).min(settings.insertions);
+            let missing = wanted.saturating_sub(descent.x.len() / VARIABLES);
             fit.inserted += insert(&mut descent, missing);
             descent.advance(SETTLING)?;
             fit.teleports += teleport::teleport(&mut descent, settings.teleport_rule);
@@ -255,8 +269,8 @@ pub fn fit_next(
                 descent.rescale();
             }
             progress(FitProgress { evaluations: descent.evaluations(), most, error: descent.cost });
-            let left = settings.insertions - fit.inserted;
-            if left == 0 || descent.cost <= settings.error_ratio * first_error.max(LEAST_FIRST_ERROR) {
+            let left = settings.insertions - fit.inserted.min(settings.insertions);
+            if settings.steady || left == 0 || descent.cost <= settings.error_ratio * reference.max(LEAST_REFERENCE) {
                 break;
             }
             let inserted = insert(&mut descent, left.div_ceil(2));

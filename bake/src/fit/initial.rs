@@ -59,3 +59,77 @@ pub fn initial(grid: &DensityGrid, objective: &Objective, n: usize, bounds: &Bou
     x.chunks_mut(VARIABLES).for_each(|g| g[4] = bounds.weight(g[4] * factor));
     x
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fit::objective::Scope;
+    use smoke_formats::gaussian::UnitSpace;
+    use smoke_formats::volume::VoxelMask;
+
+    const BOUNDS: Bounds = Bounds { radius: [0.01, 0.5], weight: [0.01, 2.0] };
+
+    fn start(side: usize, n: usize, value: impl Fn([usize; 3]) -> f32) -> (Vec<f64>, Objective) {
+        let at = |v: usize| [v % side, v / side % side, v / (side * side)];
+        let values: Vec<f32> = (0..side.pow(3)).map(|v| value(at(v))).collect();
+        let (active, name) = (VoxelMask::new(values.len()), "density".to_owned());
+        let world_from_index = Default::default();
+        let grid = DensityGrid { name, origin: [7, -4, 0], dims: [side; 3], values, active, world_from_index };
+        let objective = Objective::new(&grid, &UnitSpace::of_box([7, -4, 0], [side as u32; 3]), Scope::Box).unwrap();
+        (initial(&grid, &objective, n, &BOUNDS), objective)
+    }
+
+    #[test]
+    fn a_uniform_cube_gives_its_octants() {
+        let (x, _) = start(16, 8, |_| 3.0);
+        assert_eq!(x.len(), 8 * VARIABLES);
+        for (i, g) in x.chunks(VARIABLES).enumerate() {
+            // Morton order: x changes first.
+            let centre = [i & 1, i >> 1 & 1, i >> 2].map(|half| 0.25 + 0.5 * half as f64);
+            (0..3).for_each(|a| assert!((g[a] - centre[a]).abs() < 1e-12, "{g:?} {centre:?}"));
+            assert!((g[3] - RADIUS * 0.5).abs() < 1e-12);
+            assert_eq!(g[4], x[4]);
+        }
+    }
+
+    #[test]
+    fn the_common_factor_of_the_weights_is_the_best_one() {
+        let (x, objective) = start(16, 20, |[i, j, k]| (1 + i + 2 * j + k * k) as f32);
+        // At the least of sum (f S - D)^2 over f, here f = 1, sum e S = 0.
+        let (mut es, mut ss) = (0.0, 0.0);
+        objective.errors(&x).visit(|_, e, d| {
+            let (e, d) = (f64::from(e), f64::from(d));
+            es += e * (e + d);
+            ss += (e + d) * (e + d);
+        });
+        assert!(x.chunks(VARIABLES).all(|g| g[4] > BOUNDS.weight[0] && g[4] < BOUNDS.weight[1]));
+        // f32 rounds weights and sums by 2^-24 each, in up to 20 terms.
+        assert!(es.abs() < 20.0 * 2f64.powi(-24) * ss, "{es} {ss}");
+    }
+
+    #[test]
+    fn every_gaussian_stands_for_the_same_mass() {
+        let value = |[i, j, k]: [usize; 3]| if (i, j) == (3, 3) { 0.0 } else { 1.0 + (i * j * k % 7) as f32 };
+        let (x, _) = start(12, 25, value);
+        assert_eq!(x.len(), 25 * VARIABLES);
+        // r^3 is a stratum's volume, and its mean density is mass over volume: w r^3 is the same for all, but for the
+        // last voxel of a stratum, of at most 7.
+        let mass: Vec<f64> = x.chunks(VARIABLES).map(|g| g[4] * g[3].powi(3)).collect();
+        let mean = mass.iter().sum::<f64>() / 25.0;
+        let total: usize = (0..12usize.pow(3))
+            .map(|v| [v % 12, v / 12 % 12, v / 144])
+            .map(|[i, j, k]| if (i, j) == (3, 3) { 0 } else { 1 + i * j * k % 7 })
+            .sum();
+        let slack = 7.0 * 25.0 / total as f64;
+        assert!(mass.iter().all(|m| (m / mean - 1.0).abs() < slack), "{mass:?}");
+    }
+
+    #[test]
+    fn fewer_voxels_than_gaussians_give_one_each_and_bounds_are_kept() {
+        let (x, _) = start(16, 8, |p| f32::from(u8::from(p == [1, 2, 3] || p == [9, 9, 9])));
+        assert_eq!(x.len(), 2 * VARIABLES);
+        // 0.7 of a voxel of 1/16 is .044, between the bounds; one voxel at .0625 (9 + .5).
+        assert!((x[VARIABLES] - 9.5 / 16.0).abs() < 1e-12);
+        assert!((x[3] - 0.7 / 16.0).abs() < 1e-12);
+    }
+}

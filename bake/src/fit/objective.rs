@@ -229,7 +229,7 @@ impl CostGradient for Objective {
 /// The sums over a Gaussian's voxels of squared derivatives are integrals of Gaussians: with
 /// `I = (pi / 2)^(3/2) r^3 / voxel volume`, `sum (dS/dw)^2 = I`, `sum (dS/dc)^2 = w^2 I / r^2`,
 /// `sum (dS/dr)^2 = (15 / 4) w^2 I / r^2`; times 2 over `sum D^2`. Neighbours overlap, which makes the weights stiffer
-/// than the diagonal says, so centres and radii get [`CENTRE_UNIT`] and [`RADIUS_UNIT`] times their diagonal's unit.
+/// than the diagonal says, so centres and radii get 3 and 2 times their diagonal's unit.
 pub fn natural_units(x: &[f64], objective: &Objective) -> Vec<f64> {
     let mut units = Vec::with_capacity(x.len());
     for g in x.chunks(VARIABLES) {
@@ -241,7 +241,7 @@ pub fn natural_units(x: &[f64], objective: &Objective) -> Vec<f64> {
     units
 }
 
-/// Measured, with [`RADIUS_UNIT`] and [`LEAST_WEIGHT`]: docs/decisions/022-fit-optimiser.md.
+/// Of the diagonal's. Measured, with [`RADIUS_UNIT`] and [`LEAST_WEIGHT`]: docs/decisions/022-fit-optimiser.md.
 const CENTRE_UNIT: f64 = 3.0;
 /// See [`CENTRE_UNIT`].
 const RADIUS_UNIT: f64 = 2.0;

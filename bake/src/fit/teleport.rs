@@ -6,7 +6,7 @@
 //! [`Rule::Batch`], the default, decides by the objective itself. Taking a Gaussian away costs about `w^2 sum B^2`;
 //! one more at c with radius r gains `(sum e B)^2 / sum B^2` at its best weight (the greedy step of matching pursuit,
 //! Mallat, Zhang 1993). Candidate places are the centroids of missing density in a grid of cells; pairs of the largest
-//! gains and the least losses are exchanged, several at once, as long as the gain is [`MARGIN`] times the loss.
+//! gains and the least losses are exchanged, several at once, as long as the gain is at least the loss.
 //! The optimiser keeps its memory, less the entries of the variables moved. A move that does not lower the cost
 //! is undone. Cost: a forward pass, three moments a candidate, and one evaluation.
 
@@ -166,4 +166,114 @@ fn batch(descent: &mut Descent) -> usize {
         moves.truncate(moves.len() / 2);
     }
     moves.len()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fit::descent::Bounds;
+    use crate::fit::objective::{Objective, Scope};
+    use smoke_formats::gaussian::{Gaussian, UnitSpace};
+    use smoke_formats::volume::{DensityGrid, VoxelMask};
+    use smoke_runtime::medium::gaussian_sum::gaussian_sum;
+
+    const SIDE: usize = 40;
+    const BOUNDS: Bounds = Bounds { radius: [0.015, 0.09], weight: [0.01, 2.0] };
+    /// What the density is made of; the last is the one that the start lacks.
+    const TRUTH: [[f64; VARIABLES]; 3] =
+        [[0.3, 0.3, 0.3, 0.08, 0.9], [0.6, 0.3, 0.4, 0.07, 0.7], [0.5, 0.7, 0.6, 0.06, 0.8]];
+    /// A Gaussian where there is no density.
+    const USELESS: [f64; VARIABLES] = [0.9, 0.9, 0.1, 0.02, 0.01];
+
+    fn objective() -> Objective {
+        let space = UnitSpace::of_box([0; 3], [SIDE as u32; 3]);
+        let gaussians = TRUTH.map(|g| {
+            let [x, y, z, radius, weight] = g.map(|v| v as f32);
+            Gaussian { center: [x, y, z], radius, weight }
+        });
+        let values = gaussian_sum(&gaussians, &space, [0; 3], [SIDE; 3]);
+        let grid = DensityGrid {
+            name: "density".into(),
+            origin: [0; 3],
+            dims: [SIDE; 3],
+            active: VoxelMask::new(values.len()),
+            values,
+            world_from_index: Default::default(),
+        };
+        Objective::new(&grid, &space, Scope::Box).unwrap()
+    }
+
+    fn descent<'a>(objective: &'a Objective, gaussians: &[[f64; VARIABLES]]) -> Descent<'a> {
+        // Weights of the objective are in units of the peak.
+        let unit = |g: &[f64; VARIABLES]| [g[0], g[1], g[2], g[3], BOUNDS.weight(g[4] / f64::from(objective.peak()))];
+        let x = gaussians.iter().flat_map(unit).collect();
+        Descent::new(objective, x, BOUNDS, 10, 0.0, 1000).unwrap()
+    }
+
+    #[test]
+    fn a_useless_gaussian_goes_to_where_density_is_missing_by_every_rule() {
+        let objective = objective();
+        for rule in [Rule::Single, Rule::Batch] {
+            let mut descent = descent(&objective, &[TRUTH[0], USELESS, TRUTH[1]]);
+            let (before, kept) = (descent.cost, descent.x.clone());
+            assert_eq!(teleport(&mut descent, rule), 1);
+            assert!(descent.cost < before);
+            assert_eq!((&descent.x[..5], &descent.x[10..]), (&kept[..5], &kept[10..]));
+            // A voxel is 1/40; a cell of the candidates 2 voxels.
+            (0..3).for_each(|a| assert!((descent.x[5 + a] - TRUTH[2][a]).abs() < 0.05, "{rule:?} {:?}", descent.x));
+            // The optimiser goes on from there to the exact sum.
+            descent.advance(200).unwrap();
+            assert!(descent.cost < 1e-6, "{rule:?} {}", descent.cost);
+        }
+    }
+
+    #[test]
+    fn without_need_nothing_moves_and_a_move_that_does_not_help_is_undone() {
+        let objective = objective();
+        for rule in [Rule::Single, Rule::Batch] {
+            let mut descent = descent(&objective, &TRUTH);
+            let (cost, x) = (descent.cost, descent.x.clone());
+            assert_eq!(teleport(&mut descent, rule), 0);
+            assert_eq!((descent.cost, &descent.x), (cost, &x));
+        }
+    }
+
+    #[test]
+    fn at_rest_the_draw_decides_the_voxel_and_the_same_draw_gives_the_same() {
+        let objective = objective();
+        // Nothing is missing, so the voxel of the largest error is no use, and a random one is tried after it.
+        let run = |draw| {
+            let mut descent = descent(&objective, &[TRUTH[0], TRUTH[1], TRUTH[2], USELESS]);
+            let (before, moved) = (descent.cost, at_rest(&mut descent, draw));
+            assert!(descent.cost <= before && (moved == 1) == (descent.cost < before));
+            descent.x
+        };
+        (0..4).for_each(|draw| assert_eq!(run(draw), run(draw)));
+    }
+
+    #[test]
+    fn places_come_by_gain_and_lie_apart() {
+        let objective = objective();
+        let descent = descent(&objective, &[USELESS]);
+        let errors = objective.errors(&descent.x);
+        let found = places(&descent, &errors, 3);
+        assert_eq!(found.len(), 3);
+        assert!(found.windows(2).all(|w| w[0].gain >= w[1].gain));
+        for (i, a) in found.iter().enumerate() {
+            for b in &found[..i] {
+                let square: f64 = (0..3).map(|k| (a.gaussian[k] - b.gaussian[k]).powi(2)).sum();
+                assert!(square.sqrt() > 1.5 * a.gaussian[3].max(b.gaussian[3]));
+            }
+        }
+        // No density is missing where the sum is above it everywhere.
+        let full = self::descent(&objective, &[[0.5, 0.5, 0.5, 0.09, 1.0]; 1]);
+        assert!(places(&full, &objective.errors(&full.x), 0).is_empty());
+    }
+
+    #[test]
+    fn without_gaussians_nothing_happens() {
+        let objective = objective();
+        let mut descent = descent(&objective, &[]);
+        assert_eq!((teleport(&mut descent, Rule::Batch), at_rest(&mut descent, 0)), (0, 0));
+    }
 }

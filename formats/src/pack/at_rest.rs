@@ -10,49 +10,21 @@
 
 use super::gaussians::{self, GAUSSIAN_BYTES};
 use super::records::Codec;
+use super::zlib::{deflate, inflate};
 use crate::bounded::Bytes;
 use crate::gaussian::Gaussian;
 use crate::residual::hash::{HashTable, HashView, MAX_FRAMES};
 use crate::residual::rank::RankView;
 use crate::residual::{Residual, ResidualCodes, coded, hash, rank};
 use crate::{Error, Result};
-use flate2::Compression;
-use flate2::bufread::{ZlibDecoder, ZlibEncoder};
-use std::io::Read;
 use std::path::Path;
-
-/// A zlib stream of `bytes`.
-pub fn deflate(bytes: &[u8]) -> Vec<u8> {
-    let mut packed = vec![];
-    let read = ZlibEncoder::new(bytes, Compression::default()).read_to_end(&mut packed);
-    assert!(read.is_ok(), "reading from memory cannot fail");
-    packed
-}
-
-/// The `expected` bytes of a zlib stream that fills all of `packed`. Memory grows with what is really there.
-pub fn inflate(path: &Path, what: &str, packed: &[u8], expected: u64) -> Result<Vec<u8>> {
-    let mut bytes = vec![];
-    let mut stream = ZlibDecoder::new(packed);
-    // One byte more than expected, so that a longer stream is noticed.
-    let read = stream.by_ref().take(expected.saturating_add(1)).read_to_end(&mut bytes);
-    if let Err(e) = read {
-        return Err(Error::invalid(path, what, format!("a damaged zlib stream ({e})"), "a whole one"));
-    }
-    if bytes.len() as u64 != expected {
-        return Err(Error::invalid(path, what, format!("{} bytes or more", bytes.len()), format!("{expected} bytes")));
-    }
-    match packed.len() as u64 - stream.total_in() {
-        0 => Ok(bytes),
-        extra => Err(Error::invalid(path, what, format!("{extra} bytes after the zlib stream"), "its end")),
-    }
-}
 
 /// The Gaussians of a section at rest that claims `resident` bytes; `what` names the frame in errors.
 pub fn decode_gaussians(path: &Path, what: &str, bytes: &[u8], codec: Codec, resident: u64) -> Result<Vec<Gaussian>> {
     let list = match codec {
         Codec::Snapped => gaussians::decode(path, bytes)?,
         Codec::Deflate => gaussians::from_bytes(path, what, &inflate(path, what, bytes, resident)?)?,
-        Codec::Raw | Codec::Coded => gaussians::from_bytes(path, what, bytes)?,
+        Codec::Raw | Codec::Coded | Codec::CodedAfter => gaussians::from_bytes(path, what, bytes)?,
     };
     if (list.len() * GAUSSIAN_BYTES) as u64 != resident {
         return Err(Error::invalid(path, format!("{what}.gaussians"), list.len(), resident / GAUSSIAN_BYTES as u64));
@@ -61,21 +33,31 @@ pub fn decode_gaussians(path: &Path, what: &str, bytes: &[u8], codec: Codec, res
     Ok(list)
 }
 
-/// A rank section at rest; `resident` is the rank layout of `codes`.
-pub fn encode_rank(codes: &ResidualCodes, resident: &[u8], codec: Codec) -> Vec<u8> {
-    match codec {
-        Codec::Coded => coded::encode(codes),
-        Codec::Deflate => deflate(resident),
-        Codec::Raw | Codec::Snapped => resident.to_vec(),
+/// A rank section at rest; `resident` is the rank layout of `codes`, `previous` the frame before.
+pub fn encode_rank(codes: &ResidualCodes, resident: &[u8], codec: Codec, previous: Option<&ResidualCodes>) -> Vec<u8> {
+    match (codec, previous) {
+        (Codec::CodedAfter, Some(previous)) => coded::encode_after(codes, previous),
+        (Codec::Coded | Codec::CodedAfter, _) => coded::encode(codes),
+        (Codec::Deflate, _) => deflate(resident),
+        (Codec::Raw | Codec::Snapped, _) => resident.to_vec(),
     }
 }
 
-/// The resident rank layout of a section at rest that claims `resident` bytes.
-pub fn decode_rank(path: &Path, bytes: Vec<u8>, codec: Codec, resident: u64) -> Result<Residual> {
-    let bytes = match codec {
-        Codec::Coded => rank::encode(&coded::decode(path, &bytes)?),
-        Codec::Deflate => inflate(path, "rank", &bytes, resident)?,
-        Codec::Raw | Codec::Snapped => bytes,
+/// The resident rank layout of a section at rest that claims `resident` bytes. `previous` is the frame before; only
+/// [`Codec::CodedAfter`] reads it.
+pub fn decode_rank(
+    path: &Path,
+    bytes: Vec<u8>,
+    codec: Codec,
+    resident: u64,
+    previous: Option<&ResidualCodes>,
+) -> Result<Residual> {
+    let bytes = match (codec, previous) {
+        (Codec::Coded, _) => rank::encode(&coded::decode(path, &bytes)?),
+        (Codec::CodedAfter, Some(previous)) => rank::encode(&coded::decode_after(path, &bytes, previous)?),
+        (Codec::CodedAfter, None) => return Err(Error::invalid(path, "rank.codec", "coded after", "a frame before")),
+        (Codec::Deflate, _) => inflate(path, "rank", &bytes, resident)?,
+        (Codec::Raw | Codec::Snapped, _) => bytes,
     };
     resident_length(path, "rank", &bytes, resident)?;
     Ok(Residual::Rank(RankView::new(path, bytes)?))
@@ -98,7 +80,7 @@ pub fn encode_hash(path: &Path, frames: &[ResidualCodes], table: &HashTable, cod
             (bytes, length)
         }
         Codec::Deflate => (deflate(&resident), length),
-        Codec::Raw | Codec::Snapped => (resident, length),
+        Codec::Raw | Codec::Snapped | Codec::CodedAfter => (resident, length),
     })
 }
 
@@ -107,7 +89,7 @@ pub fn decode_hash(path: &Path, bytes: Vec<u8>, codec: Codec, resident: u64) -> 
     let bytes = match codec {
         Codec::Coded => assemble_coded(path, &bytes)?,
         Codec::Deflate => inflate(path, "hash", &bytes, resident)?,
-        Codec::Raw | Codec::Snapped => bytes,
+        Codec::Raw | Codec::Snapped | Codec::CodedAfter => bytes,
     };
     resident_length(path, "hash", &bytes, resident)?;
     Ok(Residual::Hash(HashView::new(path, bytes)?))
@@ -156,12 +138,25 @@ mod tests {
         for frame in frames_of_every_kind() {
             for codec in CODECS {
                 let resident = rank::encode(&frame);
-                let bytes = encode_rank(&frame, &resident, codec);
-                let back = decode_rank(path, bytes, codec, resident.len() as u64).unwrap();
+                let bytes = encode_rank(&frame, &resident, codec, None);
+                let back = decode_rank(path, bytes, codec, resident.len() as u64, None).unwrap();
                 assert_eq!(back.bytes(), resident);
                 assert_eq!(back.codes(0).unwrap(), frame);
             }
         }
+    }
+
+    #[test]
+    fn a_frame_coded_after_another_needs_just_that_one() {
+        let path = Path::new("p");
+        let (before, frame) = (ball([20, 30, 17], 90, 1), ball([22, 30, 15], 90, 2));
+        let resident = rank::encode(&frame);
+        let length = resident.len() as u64;
+        let bytes = encode_rank(&frame, &resident, Codec::CodedAfter, Some(&before));
+        let decode =
+            |previous: Option<&ResidualCodes>| decode_rank(path, bytes.clone(), Codec::CodedAfter, length, previous);
+        assert_eq!(decode(Some(&before)).unwrap().bytes(), resident);
+        assert!(decode(None).is_err() && decode(Some(&frame)).is_err());
     }
 
     #[test]
@@ -183,11 +178,11 @@ mod tests {
         let frames = [ball([9, 8, 7], 60, 1)];
         let resident = rank::encode(&frames[0]);
         let hash = |codec, bytes: &[u8], resident| decode_hash(path, bytes.to_vec(), codec, resident);
-        let rank = |codec, bytes: &[u8], resident| decode_rank(path, bytes.to_vec(), codec, resident);
+        let rank = |codec, bytes: &[u8], resident| decode_rank(path, bytes.to_vec(), codec, resident, None);
         type Decode<'a> = &'a dyn Fn(Codec, &[u8], u64) -> Result<Residual>;
         for codec in CODECS {
             let kinds: [(Decode, (Vec<u8>, u64)); 2] = [
-                (&rank, (encode_rank(&frames[0], &resident, codec), resident.len() as u64)),
+                (&rank, (encode_rank(&frames[0], &resident, codec, None), resident.len() as u64)),
                 (&hash, encode_hash(path, &frames, &trivial(&frames), codec).unwrap()),
             ];
             for (decode, (bytes, resident)) in kinds {

@@ -9,7 +9,7 @@
 //! in the header, the sections by theirs in the table, and the bytes between by being zero. Checksums are XXH3-64: they
 //! find damage, not malice, so everything behind them is bounded as well.
 
-use super::records::{Codec, SectionRecord, decode, kind_name};
+use super::records::{Codec, SectionRecord, decode};
 use crate::bounded::Bytes;
 use crate::{Error, Result};
 use std::path::Path;
@@ -129,6 +129,19 @@ impl Header {
     }
 }
 
+/// The name of a kind, used as the start of the path in errors.
+pub fn kind_name(kind: u32) -> &'static str {
+    match kind {
+        KIND_SEQUENCE => "sequence",
+        KIND_SETTINGS => "settings",
+        KIND_FRAMES => "frames",
+        KIND_GAUSSIANS => "gaussians",
+        KIND_RANK => "rank",
+        KIND_HASH => "hash",
+        _ => "unknown",
+    }
+}
+
 /// The table of contents: its checksum, then kinds and codecs, then where the sections lie, then their frames.
 pub fn decode_toc(path: &Path, header: &Header, bytes: &[u8]) -> Result<Vec<SectionRecord>> {
     let checksum = xxh3_64(bytes);
@@ -167,7 +180,8 @@ pub fn codec_of(path: &Path, what: &str, section: &SectionRecord) -> Result<Code
     let allowed: &[Codec] = match section.kind {
         KIND_SEQUENCE | KIND_SETTINGS | KIND_FRAMES => &[Codec::Raw],
         KIND_GAUSSIANS => &[Codec::Raw, Codec::Deflate, Codec::Snapped],
-        KIND_RANK | KIND_HASH => &[Codec::Raw, Codec::Coded, Codec::Deflate],
+        KIND_RANK => &[Codec::Raw, Codec::Coded, Codec::Deflate, Codec::CodedAfter],
+        KIND_HASH => &[Codec::Raw, Codec::Coded, Codec::Deflate],
         _ => return Err(Error::invalid(path, format!("{what}.kind"), section.kind, "1 to 6")),
     };
     allowed.iter().copied().find(|&c| c as u32 == section.codec).ok_or_else(|| {

@@ -4,10 +4,10 @@
 //! only copies. The bytes of [`EncodedFrame::to_bytes`] are for a bake's own work files, which an interrupted bake
 //! finds again; they carry a checksum and are no part of the pack's format.
 
-use super::at_rest::{decode_gaussians, deflate, encode_rank};
+use super::at_rest::{decode_gaussians, encode_rank};
 use super::gaussians::{self, GAUSSIAN_BYTES};
 use super::records::{self, Codec, FrameRecord, ResidualKind};
-use super::writer::{AtRest, FrameData};
+use super::zlib::deflate;
 use crate::bounded::Bytes;
 use crate::gaussian::Gaussian;
 use crate::residual::ResidualCodes;
@@ -17,6 +17,33 @@ use std::path::Path;
 use xxhash_rust::xxh3::xxh3_64;
 
 const MAGIC: [u8; 8] = *b"SBWORK\x01\n";
+
+/// One frame as it goes into a pack.
+#[derive(Clone, Debug)]
+pub struct FrameData<'a> {
+    /// What is known of it; the fields that [`FrameRecord`] says the writer fills in may hold anything.
+    pub record: FrameRecord,
+    /// Its Gaussians, in the order of the sum; for [`Codec::Snapped`] from [`super::snap_gaussians`].
+    pub gaussians: &'a [Gaussian],
+    /// Its residual.
+    pub codes: &'a ResidualCodes,
+}
+
+/// How sections lie in the file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct AtRest {
+    /// `Raw`, `Deflate` or `Snapped`.
+    pub gaussians: Codec,
+    /// `Raw`, `Deflate` or `Coded`.
+    pub residual: Codec,
+}
+
+impl AtRest {
+    /// The smallest file: Gaussians at 16 bits a parameter, coded residual.
+    pub const SMALLEST: Self = Self { gaussians: Codec::Snapped, residual: Codec::Coded };
+    /// Resident bytes as they are, to be uploaded without decoding.
+    pub const RAW: Self = Self { gaussians: Codec::Raw, residual: Codec::Raw };
+}
 
 /// A frame with its Gaussians and its residual, in the rank layout, as they lie at rest.
 #[derive(Clone, Debug, PartialEq)]
@@ -30,8 +57,13 @@ pub struct EncodedFrame {
 }
 
 impl EncodedFrame {
-    /// Encodes a frame; `path` is the pack that errors name.
-    pub fn new(path: &Path, frame: &FrameData, at_rest: AtRest) -> Result<Self> {
+    /// Encodes a frame; `path` is the pack that errors name. With `previous`, a coded residual is coded after that
+    /// frame's, which must be the one before in the pack.
+    pub fn new(path: &Path, frame: &FrameData, at_rest: AtRest, previous: Option<&ResidualCodes>) -> Result<Self> {
+        let at_rest = match (at_rest.residual, previous) {
+            (Codec::Coded, Some(_)) => AtRest { residual: Codec::CodedAfter, ..at_rest },
+            _ => at_rest,
+        };
         frame.codes.check(path)?;
         gaussians::check(path, &format!("frame {}", frame.record.frame), frame.gaussians)?;
         let plain: Vec<u8> = frame.gaussians.iter().flat_map(gaussians::to_bytes).collect();
@@ -40,10 +72,12 @@ impl EncodedFrame {
             Codec::Raw => plain,
             Codec::Deflate => deflate(&plain),
             Codec::Snapped => gaussians::encode(path, frame.gaussians)?,
-            Codec::Coded => return Err(Error::invalid(path, "gaussians.codec", "Coded", "Raw, Deflate, Snapped")),
+            Codec::Coded | Codec::CodedAfter => {
+                return Err(Error::invalid(path, "gaussians.codec", "Coded", "Raw, Deflate, Snapped"));
+            }
         };
         let ranks = rank::encode(frame.codes);
-        let residual = encode_rank(frame.codes, &ranks, at_rest.residual);
+        let residual = encode_rank(frame.codes, &ranks, at_rest.residual, previous);
         let record = FrameRecord {
             origin: frame.codes.origin,
             dims: frame.codes.dims,
@@ -139,7 +173,8 @@ mod tests {
         for at_rest in [AtRest::SMALLEST, AtRest::RAW] {
             let gaussians = super::super::snap_gaussians(path, &gaussians).unwrap();
             let frame =
-                EncodedFrame::new(path, &FrameData { record, gaussians: &gaussians, codes: &codes }, at_rest).unwrap();
+                EncodedFrame::new(path, &FrameData { record, gaussians: &gaussians, codes: &codes }, at_rest, None)
+                    .unwrap();
             let bytes = frame.to_bytes(path).unwrap();
             let back = EncodedFrame::from_bytes(path, &bytes).unwrap();
             assert_eq!(back, frame);

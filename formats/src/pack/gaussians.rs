@@ -14,7 +14,7 @@
 //! 1 %, the fit error changes by less than 0.01 % of itself (see the tests), against the 1 % that would matter.
 //! Size: 20 bytes a Gaussian plain, below 9.5 snapped for 600 of them, evenly spread.
 
-use super::at_rest::{deflate, inflate};
+use super::zlib::{deflate, inflate};
 use crate::bounded::Bytes;
 use crate::gaussian::Gaussian;
 use crate::{Error, Result};

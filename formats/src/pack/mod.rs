@@ -19,13 +19,14 @@ pub mod reader;
 pub mod records;
 mod validate;
 pub mod writer;
+mod zlib;
 
-pub use encoded::EncodedFrame;
+pub use encoded::{AtRest, EncodedFrame, FrameData};
 pub use gaussians::snap_gaussians;
 pub use reader::{FrameResidual, Pack};
 pub use records::{Codec, FrameRecord, Promise, ResidualKind, SequenceRecord, SettingsRecord};
 pub use validate::{Finding, validate, validate_bytes};
-pub use writer::{AtRest, FrameData, PackWriter, write};
+pub use writer::{PackWriter, write};
 
 #[cfg(test)]
 mod damage_tests;

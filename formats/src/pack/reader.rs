@@ -10,10 +10,10 @@
 use super::at_rest::{decode_gaussians, decode_hash, decode_rank};
 use super::container::{
     HEADER_BYTES, Header, KIND_FRAMES, KIND_GAUSSIANS, KIND_HASH, KIND_RANK, KIND_SEQUENCE, KIND_SETTINGS, codec_of,
-    decode_toc,
+    decode_toc, kind_name,
 };
 use super::records::{
-    FrameRecord, MAX_RECORD_BYTES, ResidualKind, SectionRecord, SequenceRecord, SettingsRecord, decode, kind_name,
+    Codec, FrameRecord, MAX_RECORD_BYTES, ResidualKind, SectionRecord, SequenceRecord, SettingsRecord, decode,
 };
 use crate::gaussian::Gaussian;
 use crate::residual::{Residual, ResidualCodes};
@@ -119,6 +119,7 @@ impl Pack {
             frame.check(path, number, &sequence)?;
         }
         let sections = sections_of_frames(path, &toc, &frames)?;
+        check_chains(path, &toc, &sections)?;
         let last = Mutex::new(None);
         Ok(Self { path: path.to_owned(), source, header, toc, sequence, settings, frames, sections, last })
     }
@@ -185,7 +186,14 @@ impl Pack {
                 let bytes = self.section_bytes(&what, section)?;
                 let residual = Arc::new(match section.kind {
                     KIND_HASH => decode_hash(&self.path, bytes, codec, section.bytes_resident)?,
-                    _ => decode_rank(&self.path, bytes, codec, section.bytes_resident)?,
+                    _ => {
+                        // At most [`MAX_CHAIN`] deep, which was checked on opening.
+                        let previous = match codec {
+                            Codec::CodedAfter => Some(self.residual(frame - 1)?.codes()?),
+                            _ => None,
+                        };
+                        decode_rank(&self.path, bytes, codec, section.bytes_resident, previous.as_ref())?
+                    }
                 });
                 *self.last.lock().unwrap_or_else(PoisonError::into_inner) = Some((number, residual.clone()));
                 residual
@@ -259,6 +267,23 @@ fn read_at(path: &Path, source: &Source, file_bytes: u64, offset: u64, length: u
             Ok(bytes)
         }
     }
+}
+
+/// Frames that one frame may need before it: a hostile chain must not cost more than a short one.
+const MAX_CHAIN: usize = 63;
+
+/// Fails on a first frame that is coded after another, and on too many of them in a row.
+fn check_chains(path: &Path, toc: &[SectionRecord], sections: &[(usize, usize)]) -> Result<()> {
+    let mut chain = MAX_CHAIN;
+    for (frame, &(_, residual)) in sections.iter().enumerate() {
+        let after = toc[residual].codec == Codec::CodedAfter as u32;
+        chain = if after { chain + 1 } else { 0 };
+        if chain > MAX_CHAIN {
+            let expected = format!("a frame before, and at most {MAX_CHAIN} of them in a row");
+            return Err(Error::invalid(path, format!("frames[{frame}].residual.codec"), "coded after", expected));
+        }
+    }
+    Ok(())
 }
 
 /// Finds every frame's two sections: each exactly once, of the kind that its record says.

@@ -3,7 +3,6 @@
 //!
 //! Fields of fixed size come first, so that their offsets can be stated in `FORMAT.md`.
 
-use super::container::{KIND_FRAMES, KIND_SEQUENCE, KIND_SETTINGS};
 use crate::{Error, Result};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
@@ -30,12 +29,16 @@ pub enum Codec {
     Deflate = 2,
     /// Gaussians only: 16 bits a parameter on the frame's own lattice.
     Snapped = 3,
+    /// Rank layout only: coded with the help of the frame before, which must be decoded first.
+    CodedAfter = 4,
 }
 
 impl Codec {
     /// The codec of a number in a file, if it is one.
     pub fn from_number(number: u32) -> Option<Self> {
-        [Self::Raw, Self::Coded, Self::Deflate, Self::Snapped].into_iter().find(|&c| c as u32 == number)
+        [Self::Raw, Self::Coded, Self::Deflate, Self::Snapped, Self::CodedAfter]
+            .into_iter()
+            .find(|&c| c as u32 == number)
     }
 }
 
@@ -176,19 +179,6 @@ pub fn decode<T: DeserializeOwned>(path: &Path, what: &str, bytes: &[u8]) -> Res
     match used == bytes.len() {
         true => Ok(record),
         false => Err(Error::invalid(path, what, format!("{} bytes", bytes.len()), format!("{used} bytes"))),
-    }
-}
-
-/// The name of a kind, used as the start of the path in errors.
-pub fn kind_name(kind: u32) -> &'static str {
-    match kind {
-        KIND_SEQUENCE => "sequence",
-        KIND_SETTINGS => "settings",
-        KIND_FRAMES => "frames",
-        super::container::KIND_GAUSSIANS => "gaussians",
-        super::container::KIND_RANK => "rank",
-        super::container::KIND_HASH => "hash",
-        _ => "unknown",
     }
 }
 

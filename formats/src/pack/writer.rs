@@ -7,43 +7,15 @@ use super::at_rest::encode_hash;
 use super::container::{
     ALIGNMENT, HEADER_BYTES, Header, KIND_FRAMES, KIND_GAUSSIANS, KIND_HASH, KIND_RANK, KIND_SEQUENCE, KIND_SETTINGS,
 };
-use super::encoded::EncodedFrame;
+use super::encoded::{AtRest, EncodedFrame, FrameData};
 use super::gaussians::GAUSSIAN_BYTES;
 use super::records::{Codec, FrameRecord, ResidualKind, SectionRecord, SequenceRecord, SettingsRecord, encode};
-use crate::gaussian::Gaussian;
 use crate::residual::ResidualCodes;
 use crate::residual::hash::{HashTable, MAX_FRAMES};
 use crate::{Error, Result};
 use std::io::{BufWriter, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use xxhash_rust::xxh3::xxh3_64;
-
-/// One frame as it goes into a pack.
-#[derive(Clone, Debug)]
-pub struct FrameData<'a> {
-    /// What is known of it; the fields that [`FrameRecord`] says the writer fills in may hold anything.
-    pub record: FrameRecord,
-    /// Its Gaussians, in the order of the sum; for [`Codec::Snapped`] from [`super::snap_gaussians`].
-    pub gaussians: &'a [Gaussian],
-    /// Its residual.
-    pub codes: &'a ResidualCodes,
-}
-
-/// How sections lie in the file.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct AtRest {
-    /// `Raw`, `Deflate` or `Snapped`.
-    pub gaussians: Codec,
-    /// `Raw`, `Deflate` or `Coded`.
-    pub residual: Codec,
-}
-
-impl AtRest {
-    /// The smallest file: Gaussians at 16 bits a parameter, coded residual.
-    pub const SMALLEST: Self = Self { gaussians: Codec::Snapped, residual: Codec::Coded };
-    /// Resident bytes as they are, to be uploaded without decoding.
-    pub const RAW: Self = Self { gaussians: Codec::Raw, residual: Codec::Raw };
-}
 
 /// Writes a pack as a whole or not at all: `fill` pushes the frames and ends with [`PackWriter::finish`].
 pub fn write(path: &Path, fill: impl FnOnce(PackWriter<&mut BufWriter<std::fs::File>>) -> Result<u64>) -> Result<u64> {
@@ -74,7 +46,7 @@ impl<W: Write + Seek> PackWriter<W> {
 
     /// The next frame, its residual in the rank layout.
     pub fn push_rank(&mut self, frame: &FrameData, at_rest: AtRest) -> Result<()> {
-        let encoded = EncodedFrame::new(&self.path, frame, at_rest)?;
+        let encoded = EncodedFrame::new(&self.path, frame, at_rest, None)?;
         self.push_encoded(&encoded)
     }
 
@@ -98,7 +70,7 @@ impl<W: Write + Seek> PackWriter<W> {
         let mut records = vec![];
         for (number, frame) in (first..).zip(tile) {
             // Only the Gaussians are taken of it; the residual goes into the tile's own section.
-            let encoded = EncodedFrame::new(&self.path, frame, AtRest { residual: Codec::Raw, ..at_rest })?;
+            let encoded = EncodedFrame::new(&self.path, frame, AtRest { residual: Codec::Raw, ..at_rest }, None)?;
             self.push_gaussians(number, &encoded)?;
             let residual = (encoded.residual.len() as u64, encoded.record.rank_bytes);
             records.push(FrameRecord {

@@ -12,19 +12,9 @@
 //! bake time is what is seen at render time.
 
 pub mod brick;
-mod code_model;
 pub mod coded;
-mod earlier;
 pub mod hash;
-mod least_squares;
-mod logistic;
-mod mixing;
-mod predict;
-mod range_coder;
 pub mod rank;
-mod ranks;
-mod support;
-mod sweep;
 
 use crate::bounded::MAX_DENSE_VOXELS;
 use crate::volume::VoxelMask;

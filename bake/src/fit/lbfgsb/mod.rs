@@ -57,6 +57,7 @@ pub struct Lbfgsb {
     max_evaluations: usize,
     gradient_tolerance: f64,
     cost_tolerance: f64,
+    cost_floor: f64,
     first_step: Option<f64>,
     finished: Option<&'static str>,
 }
@@ -79,6 +80,7 @@ impl Lbfgsb {
             max_evaluations: usize::MAX,
             gradient_tolerance: 1e-5,
             cost_tolerance: 1e7 * f64::EPSILON,
+            cost_floor: 1.0,
             first_step: None,
             finished: None,
         })
@@ -90,9 +92,10 @@ impl Lbfgsb {
         self
     }
 
-    /// Stops when an iteration lowers the cost by at most this fraction (default 2.2e-9).
-    pub fn cost_tolerance(mut self, tolerance: f64) -> Self {
-        self.cost_tolerance = tolerance;
+    /// Stops when an iteration lowers the cost by at most `tolerance * max(|before|, |after|, floor)` (default 2.2e-9
+    /// and 1, as in the original code, which takes any cost below 1 for 1). The floor is 0 where small costs count.
+    pub fn cost_tolerance(mut self, tolerance: f64, floor: f64) -> Self {
+        (self.cost_tolerance, self.cost_floor) = (tolerance, floor);
         self
     }
 
@@ -112,6 +115,12 @@ impl Lbfgsb {
     /// Evaluations of the objective so far.
     pub fn evaluations(&self) -> usize {
         self.evaluations
+    }
+
+    /// Whether the last run ended by a test of the solver (converged, stuck, or out of evaluations), not by the
+    /// executor's limit of iterations.
+    pub fn finished(&self) -> bool {
+        self.finished.is_some() || self.evaluations >= self.max_evaluations
     }
 
     /// Changes the unit of the variables: variable i is now worth `ratio[i]` times its old value.
@@ -272,7 +281,13 @@ impl<O: CostGradient> Solver<O, State> for Lbfgsb {
         let g = state.take_gradient().ok_or_else(missing)?;
         let cost = state.cost;
         let bounds = (&self.lower[..], &self.upper[..]);
-        let cauchy = cauchy::cauchy_point(&x, &g, bounds.0, bounds.1, &self.memory);
+        let bounded = bounds.0.iter().chain(bounds.1).any(|b| b.is_finite());
+        let cauchy = if bounded || self.memory.pairs() == 0 {
+            cauchy::cauchy_point(&x, &g, bounds.0, bounds.1, &self.memory)
+        } else {
+            // Without bounds the subspace is the whole space, whose minimum does not depend on where it is sought from.
+            cauchy::Cauchy { point: x.clone(), c: vec![0.0; 2 * self.memory.pairs()] }
+        };
         let target = subspace::subspace_point(&x, &g, bounds, &self.memory, cauchy);
         match self.search(problem, (&x, &g, cost), &target)? {
             Some((point, gradient, new)) => {
@@ -284,7 +299,7 @@ impl<O: CostGradient> Solver<O, State> for Lbfgsb {
                 self.memory.push(s, y);
                 if self.projected_gradient(&point, &gradient) <= self.gradient_tolerance {
                     self.finished = Some("the projected gradient vanishes");
-                } else if cost - new <= self.cost_tolerance * cost.abs().max(new.abs()) {
+                } else if cost - new <= self.cost_tolerance * cost.abs().max(new.abs()).max(self.cost_floor) {
                     self.finished = Some("the cost falls no more");
                 }
                 Ok((state.param(point).gradient(gradient).cost(new), None))

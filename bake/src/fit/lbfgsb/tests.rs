@@ -19,7 +19,7 @@ fn minimise(
     lower: Vec<f64>,
     upper: Vec<f64>,
 ) -> Result<(Vec<f64>, f64, usize), Error> {
-    let solver = Lbfgsb::new(lower, upper, 10)?.gradient_tolerance(1e-9).cost_tolerance(0.0);
+    let solver = Lbfgsb::new(lower, upper, 10)?.gradient_tolerance(1e-9).cost_tolerance(0.0, 0.0);
     let result =
         Executor::new(Function(f), solver).configure(|s: State| s.param(x).max_iters(5000)).timer(false).run()?;
     let best = result.state.param.clone().unwrap_or_default();

@@ -30,13 +30,25 @@
 //! 4.2 to 3.6 bits a voxel of a rough plume at max error 0.002, 2.5 to 2.0 at 0.01, and a sixth less after the frame
 //! before. Support included; SZ3 takes 6.4 to 5.6 and 4.0 to 3.3.
 
+mod code_model;
+mod earlier;
+mod least_squares;
+mod logistic;
+mod mixing;
+mod predict;
+mod range_coder;
+mod ranks;
+mod support;
+mod sweep;
+
 use super::ResidualCodes;
-use super::code_model::CodeModel;
-use super::earlier::{self, Earlier};
-use super::predict::Predictor;
-use super::range_coder::{BitChannel, Decoder, Encoder};
-use super::ranks::Ranks;
-use super::{support, sweep::Sweep};
+use code_model::CodeModel;
+use earlier::Earlier;
+use predict::Predictor;
+use range_coder::{BitChannel, Decoder, Encoder};
+use ranks::Ranks;
+use sweep::Sweep;
+
 use crate::bounded::{Bytes, MAX_DENSE_VOXELS};
 use crate::volume::VoxelMask;
 use crate::{Error, Result};

@@ -3,9 +3,9 @@
 //! Both frames lie in one index space; where the earlier one has no code its value is 0. Four planes are kept, in the
 //! sweep of the later frame: two before the plane that is coded, the plane itself, and the one after it.
 
-use super::ResidualCodes;
 use super::ranks::Ranks;
 use super::sweep::Sweep;
+use crate::residual::ResidualCodes;
 
 /// Taps in the earlier frame, as steps along the fastest, middle and slowest axis of the sweep.
 pub(super) const TAPS: [[isize; 3]; 8] =
