@@ -17,6 +17,8 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 type Failure = Box<dyn std::error::Error>;
+/// A name, and which of the figures of new frame, new lights, new camera it is.
+type Stage = (&'static str, fn(&[Seconds; 3]) -> f64);
 const RUNS: usize = 5;
 const COUNTS: [usize; 4] = [150, 300, 600, 1200];
 
@@ -154,7 +156,7 @@ fn main() -> Result<(), Failure> {
     println!("|---|---|---|---|---|---|");
     let runs = COUNTS.iter().map(|&n| one(centres(4), n)).collect::<Result<Vec<_>, _>>()?;
     let x = COUNTS.map(|n| n as f64);
-    let stages: [(&str, fn(&[Seconds; 3]) -> f64); 3] = [
+    let stages: [Stage; 3] = [
         ("source radiance, new frame", |s| s[0].source_radiance),
         ("source radiance, new lights", |s| s[1].source_radiance),
         ("volume pass", |s| s[0].volume_pass),
