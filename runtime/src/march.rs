@@ -228,10 +228,10 @@ fn before(marched: Pixel, medium: &MarchMedium, backdrop: &dyn Backdrop, directi
     let behind = backdrop.behind(direction);
     if medium.peak_ratio != [1.0; 3] {
         let peak = backdrop.through_peak(direction);
-        for c in 0..3 {
+        for (c, peak) in peak.into_iter().enumerate() {
             let through = marched.transmittance[c];
             pixel.transmittance[c] = through.powf(medium.peak_ratio[c]);
-            pixel.radiance[c] += (through - pixel.transmittance[c]) * peak[c];
+            pixel.radiance[c] += (through - pixel.transmittance[c]) * peak;
         }
     }
     (0..3).for_each(|c| pixel.radiance[c] += pixel.transmittance[c] * behind[c]);
@@ -344,12 +344,12 @@ impl State {
     fn add(&mut self, volume: &ShadedVolume, samples: &mut Samples, optics: &Optics) -> bool {
         let (mut cell, mut fraction) = ([0usize; LANES], [[0.0f32; LANES]; 3]);
         let mut stride = 1;
-        for a in 0..3 {
+        for (fraction, place) in fraction.iter_mut().zip(&samples.place) {
             for s in 0..LANES {
-                let p = samples.place[a][s].clamp(0.0, BRICK as f32);
+                let p = place[s].clamp(0.0, BRICK as f32);
                 let base = (p as i32).min(BRICK as i32 - 1);
                 cell[s] += base as usize * stride;
-                fraction[a][s] = p - base as f32;
+                fraction[s] = p - base as f32;
             }
             stride *= SIDE;
         }

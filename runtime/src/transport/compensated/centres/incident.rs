@@ -51,7 +51,6 @@ pub fn incident(lights: &[Light], directions: &Directions, rings: usize, world_f
 mod tests {
     use super::*;
     use crate::light::Environment;
-    use glam::Vec3;
 
     fn sampled(lights: &[Light], rings: usize, turn: DMat3) -> (Vec<[f32; 3]>, Directions) {
         let directions = Directions::product(rings, 2 * rings);

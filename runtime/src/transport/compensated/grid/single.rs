@@ -194,8 +194,8 @@ fn advance(grid: &SweepGrid, rays: &mut Rays, path: &Path, shift: &Shift, densit
             let before = &mut rays.density[start + block..][..len];
             for c in 0..len {
                 depth[c] += half * (before[c] + met[c]);
-                before[c] = met[c];
             }
+            before.copy_from_slice(met);
         }
     }
 }
