@@ -243,7 +243,7 @@ pub fn natural_units(x: &[f64], objective: &Objective) -> Vec<f64> {
 
 /// Of the diagonal's. Measured, with [`RADIUS_UNIT`] and [`LEAST_WEIGHT`]: docs/decisions/022-fit-optimiser.md.
 const CENTRE_UNIT: f64 = 3.0;
-/// See [`CENTRE_UNIT`].
+/// See `CENTRE_UNIT`.
 const RADIUS_UNIT: f64 = 2.0;
 /// A weight below this is taken for this: the units of a vanishing Gaussian's centre would be too large to be of use.
 const LEAST_WEIGHT: f64 = 0.1;
