@@ -290,15 +290,21 @@ pub struct RenderArgs {
     /// Voxels between nodes of multiple scattering (route grid) [default: 2; 1 in thick smoke, more in huge frames].
     #[arg(long, value_name = "VOXELS", value_parser = clap::value_parser!(u32).range(1..=64))]
     pub scatter_step: Option<u32>,
+    /// Rings of directions that multiple scattering is gathered along; twice as many in azimuth [default: 5].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(2..=32))]
+    pub scatter_rings: Option<u8>,
+    /// Bands of the phase function that multiple scattering keeps, at most --sh-order [default: 3].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=6))]
+    pub scatter_order: Option<u8>,
     /// From optical depth to transmittance (route centres) [default: direct].
     #[arg(long, value_enum)]
     pub exponential: Option<ExponentialChoice>,
     /// Light scattered more than once [default: transport with route grid, integral with route centres].
     #[arg(long, value_enum)]
     pub multiple: Option<MultipleChoice>,
-    /// Voxels between samples along a ray.
-    #[arg(long, value_name = "VOXELS", default_value_t = 0.5, value_parser = march_step)]
-    pub march_step: f64,
+    /// Voxels between samples along a ray [default: 1, less where the medium is thick].
+    #[arg(long, value_name = "VOXELS", value_parser = march_step)]
+    pub march_step: Option<f64>,
     /// Transmittance below which a ray ends.
     #[arg(long, value_name = "T", default_value_t = 0.001, value_parser = cutoff)]
     pub cutoff: f64,

@@ -220,6 +220,8 @@ fn settings(args: &RenderArgs) -> Result<RenderSettings, Failure> {
     };
     refuse(single && args.multiple.is_some(), "--multiple", "--order single")?;
     refuse(single && args.scatter_step.is_some(), "--scatter-step", "--order single")?;
+    refuse(single && args.scatter_rings.is_some(), "--scatter-rings", "--order single")?;
+    refuse(single && args.scatter_order.is_some(), "--scatter-order", "--order single")?;
     let route = match args.route {
         RouteChoice::Grid => {
             let with = "--route grid";
@@ -230,6 +232,8 @@ fn settings(args: &RenderArgs) -> Result<RenderSettings, Failure> {
                 beams: args.beams.map_or(d.beams, |v| v as usize),
                 single_step: args.source_step.map_or(d.single_step, |v| v as usize),
                 multiple_step: args.scatter_step.map_or(d.multiple_step, |v| v as usize),
+                rings: args.scatter_rings.map_or(d.rings, usize::from),
+                multiple_order: args.scatter_order.map_or(d.multiple_order, usize::from),
                 ..d
             })
         }
@@ -238,6 +242,8 @@ fn settings(args: &RenderArgs) -> Result<RenderSettings, Failure> {
             refuse(args.beams.is_some(), "--beams", with)?;
             refuse(args.source_step.is_some(), "--source-step", with)?;
             refuse(args.scatter_step.is_some(), "--scatter-step", with)?;
+            refuse(args.scatter_rings.is_some(), "--scatter-rings", with)?;
+            refuse(args.scatter_order.is_some(), "--scatter-order", with)?;
             refuse(args.multiple == Some(MultipleChoice::Transport), "--multiple transport", with)?;
             let exponential = match args.exponential.unwrap_or_default() {
                 ExponentialChoice::Direct => Exponential::Direct,
@@ -255,8 +261,11 @@ fn settings(args: &RenderArgs) -> Result<RenderSettings, Failure> {
         }
     };
     let scattering = if single { ScatteringOrder::Single } else { ScatteringOrder::All };
-    let march =
-        MarchSettings { step: args.march_step as f32, cutoff: args.cutoff as f32, samples: usize::from(args.samples) };
+    let march = MarchSettings {
+        step: args.march_step.unwrap_or(0.0) as f32,
+        cutoff: args.cutoff as f32,
+        samples: usize::from(args.samples),
+    };
     Ok(RenderSettings { route, sh_order: usize::from(args.sh_order), scattering, march })
 }
 
@@ -266,7 +275,7 @@ fn document(args: &RenderArgs, settings: &RenderSettings, scene: &Scene) -> Valu
     let mut render = json!({
         "order": if args.order == Order::Single { "single" } else { "all" },
         "sh_order": settings.sh_order,
-        "march_step": args.march_step,
+        "march_step": args.march_step.map_or(json!("automatic"), |step| json!(step)),
         "cutoff": args.cutoff,
         "samples": args.samples,
     });
@@ -277,6 +286,8 @@ fn document(args: &RenderArgs, settings: &RenderSettings, scene: &Scene) -> Valu
             render["beams"] = json!(grid.beams);
             render["source_step"] = automatic(grid.single_step);
             render["scatter_step"] = automatic(grid.multiple_step);
+            render["scatter_rings"] = json!(grid.rings);
+            render["scatter_order"] = json!(grid.multiple_order);
             render["rings"] = json!(grid.rings);
             render["multiple_order"] = json!(grid.multiple_order);
             render["tolerance"] = json!(grid.tolerance);

@@ -2,8 +2,9 @@
 //!
 //! `L = sum over samples of T J (1 - e^-x)`, `x = sigma_t D ds`, `T` the transmittance so far, front to back. The paper
 //! adds `x J` instead of `(1 - e^-x) J`, which overshoots by 2.3 % at x = 0.05 and by 58 % at x = 1; and marches slices
-//! back to front, where this stops as soon as nothing behind can be seen. Samples lie at fixed distances from the eye,
-//! by default half a voxel apart; bricks without density are stepped over, which changes no sample.
+//! back to front, where this stops as soon as nothing behind can be seen. Samples lie at fixed distances from the eye:
+//! the paper's half a voxel apart on request, by default a voxel, or less where that would be more than
+//! [`DEPTH_PER_SAMPLE`] of optical depth (measured on the plume: `docs/decisions/030-march-step.md`); bricks without density are stepped over, which changes no sample.
 //! Each brick holds copies of the nodes at its far faces, so that a fetch stays inside 2000 bytes with fixed strides; the
 //! samples of a brick are placed and their exponentials taken by lanes, and added up one after the other.
 //! Cost: O(pixels x samples in dense bricks), each one trilinear fetch of four channels at once.
@@ -25,6 +26,10 @@ const BRICK_NODES: usize = SIDE * SIDE * SIDE;
 const LAST_CELL: usize = (BRICK - 1) * (1 + SIDE + SIDE * SIDE);
 /// Samples that are placed and exponentiated together.
 const LANES: usize = 16;
+/// Largest optical depth between two samples where the step is chosen.
+const DEPTH_PER_SAMPLE: f64 = 0.3;
+/// Smallest step that is chosen, in voxels: below it the density is known no better than linearly.
+const LEAST_STEP: f64 = 0.25;
 /// Marks a brick without density.
 const EMPTY: u32 = u32::MAX;
 
@@ -38,12 +43,13 @@ pub struct ShadedVolume {
     places: Vec<u32>,
     bricks: [usize; 3],
     world_from_node: DAffine3,
+    density_max: f32,
 }
 
 /// The dials of the march.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MarchSettings {
-    /// Distance between samples in voxels (along the shortest voxel side), in (0, 4].
+    /// Distance between samples in voxels (along the shortest voxel side), in (0, 4]; 0 chooses.
     pub step: f32,
     /// A ray ends where its transmittance falls below this; what is left is taken to be as bright as there.
     pub cutoff: f32,
@@ -52,9 +58,9 @@ pub struct MarchSettings {
 }
 
 impl Default for MarchSettings {
-    /// Half a voxel, as in the paper, one part in a thousand, and one ray a pixel.
+    /// A step that fits the medium, one part in a thousand, and one ray a pixel.
     fn default() -> Self {
-        Self { step: 0.5, cutoff: 1e-3, samples: 1 }
+        Self { step: 0.0, cutoff: 1e-3, samples: 1 }
     }
 }
 
@@ -90,7 +96,20 @@ impl ShadedVolume {
                 out.push(*copy);
             }
         }
-        Self { dims, nodes: out, places, bricks, world_from_node }
+        let density_max = nodes.iter().map(|n| n[3]).fold(0.0, f32::max);
+        Self { dims, nodes: out, places, bricks, world_from_node, density_max }
+    }
+
+    /// World length between samples.
+    fn sample_distance(&self, step: f32, sigma_t: [f32; 3]) -> f64 {
+        let sides = [0, 1, 2].map(|a| self.world_from_node.matrix3.col(a).length());
+        let voxel = sides.into_iter().fold(f64::INFINITY, f64::min);
+        if step > 0.0 {
+            return voxel * f64::from(step);
+        }
+        let thickest = f64::from(sigma_t.into_iter().fold(0.0, f32::max)) * f64::from(self.density_max) * voxel;
+        // No density at all divides by zero, and takes the largest step.
+        voxel * (DEPTH_PER_SAMPLE / thickest).clamp(LEAST_STEP, 1.0)
     }
 
     /// Largest and smallest distance along a ray inside the box, or none.
@@ -175,8 +194,7 @@ pub fn march(
     settings: &MarchSettings,
 ) -> Film {
     let node_from_world = volume.world_from_node.inverse();
-    let voxel = (0..3).map(|a| volume.world_from_node.matrix3.col(a).length()).fold(f64::INFINITY, f64::min);
-    let ds = voxel * f64::from(settings.step);
+    let ds = volume.sample_distance(settings.step, medium.sigma_t);
     let origin = node_from_world.transform_point3(camera.position);
     let view = View { volume, camera, medium, backdrop, node_from_world, origin, ds, settings };
     let mut film = Film::new(camera.width, camera.height);

@@ -231,7 +231,8 @@ fn check(settings: &RenderSettings) -> Result<(), RenderError> {
     };
     let march = settings.march;
     setting((1..=6).contains(&settings.sh_order), "SH order", settings.sh_order.to_string(), "1 to 6")?;
-    setting(march.step > 0.0 && march.step <= 4.0, "march step", march.step.to_string(), "voxels above 0, up to 4")?;
+    let step = (0.0..=4.0).contains(&march.step);
+    setting(step, "march step", march.step.to_string(), "voxels up to 4, or 0 to choose")?;
     setting((0.0..1.0).contains(&march.cutoff), "cutoff", march.cutoff.to_string(), "0 to below 1")?;
     setting((1..=64).contains(&march.samples), "samples", march.samples.to_string(), "1 to 64")?;
     if let Route::Grid(grid) = settings.route {

@@ -42,12 +42,12 @@ pub struct GridSettings {
 impl Default for GridSettings {
     fn default() -> Self {
         Self {
-            beams: 96,
+            beams: 64,
             single_step: 0,
             multiple_step: 0,
-            rings: 6,
-            multiple_order: 2,
-            tolerance: 2e-3,
+            rings: 5,
+            multiple_order: 3,
+            tolerance: 1e-3,
             iterations: 40,
         }
     }

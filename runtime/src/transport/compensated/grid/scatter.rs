@@ -7,7 +7,7 @@
 //! at albedo 1, and a constant J gives exactly `1 - transmittance` along every ray, so the white furnace holds.
 //! The matrix is never formed: one product costs one sweep, O(nodes x directions).
 
-use super::columns::{Path, Shift, SweepGrid, add_turned, stencil, turn};
+use super::columns::{Path, Shift, Slices, SweepGrid, add_turned, stencil, turn};
 use crate::lanes::{exp_neg_and_rest, near_share};
 use glam::Vec3;
 use multiversion::multiversion;
@@ -96,30 +96,63 @@ fn sweep(
         depth: rays(),
         opacity: three(),
     };
-    let mut slice_source = [0, 1, 2].map(|_| vec![0.0; slices.columns * slices.rows]);
+    // An isotropic source is read where it lies; another is first summed up for this direction.
+    let isotropic = ordinate.harmonics.len() == 1;
+    let mut summed = [0, 1, 2].map(|_| vec![0.0; if isotropic { 0 } else { slices.columns * slices.rows }]);
     for step in 0..slices.count {
         let shift = path.shift(step);
-        source_along(slices, shift.slice, &ordinate.harmonics, planes, &mut slice_source);
-        advance(grid, &mut rays, path, &shift, sigma_t, density, &slice_source);
+        let source = if isotropic {
+            let start = slices.row(shift.slice, 0);
+            let stride = slices.row(shift.slice, 1) - start;
+            let channels = [0, 1, 2].map(|c| &planes[c][start..]);
+            SliceSource { channels, stride, scale: ordinate.harmonics[0] }
+        } else {
+            source_along(grid, slices, shift.slice, &ordinate.harmonics, planes, &mut summed);
+            let channels = [0, 1, 2].map(|c| &summed[c][..]);
+            SliceSource { channels, stride: slices.columns, scale: 1.0 }
+        };
+        advance(grid, &mut rays, path, &shift, sigma_t, density, &source);
         deposit(grid, &rays, path, &shift, sigma_t, ordinate, out);
     }
 }
 
-/// The source radiance of one slice into the sweep's direction: `sum over lm of J_lm y_lm`.
+/// The source radiance of one slice into a sweep's direction: `scale * channels[c][row * stride + column]`.
+struct SliceSource<'a> {
+    channels: [&'a [f32]; 3],
+    stride: usize,
+    scale: f32,
+}
+
+/// The source radiance of one slice into the sweep's direction, `sum over lm of J_lm y_lm`, at the nodes that rays with
+/// anything to carry will read.
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn source_along(
-    slices: &super::columns::Slices,
+    grid: &SweepGrid,
+    slices: &Slices,
     slice: usize,
     harmonics: &[f32],
     planes: &[Vec<f32>],
     out: &mut [Vec<f32>; 3],
 ) {
     let n = slices.columns;
-    for (channel, out) in out.iter_mut().enumerate() {
-        for row in 0..slices.rows {
-            let at = slices.row(slice, row);
-            let out = &mut out[row * n..][..n];
+    for row in 0..slices.rows {
+        // Row r is read by the rays between r - 1 and r and by those between r and r + 1.
+        let [above, below] = [row.saturating_sub(1), row.min(slices.rows - 2)];
+        let (a, b) = (grid.active_rays(slices, slice, above), grid.active_rays(slices, slice, below));
+        let (first, end) = if a.is_empty() || b.is_empty() {
+            (a.start.max(b.start), a.end.max(b.end))
+        } else {
+            (a.start.min(b.start), a.end.max(b.end))
+        };
+        if a.is_empty() && b.is_empty() {
+            continue;
+        }
+        let range = first.min(n)..(end + 1).min(n);
+        let at = slices.row(slice, row);
+        for channel in 0..3 {
+            let out = &mut out[channel][row * n..][range.clone()];
             for (coefficient, &y) in harmonics.iter().enumerate() {
-                let plane = &planes[coefficient * 3 + channel][at..][..n];
+                let plane = &planes[coefficient * 3 + channel][at..][range.clone()];
                 if coefficient == 0 {
                     out.iter_mut().zip(plane).for_each(|(o, p)| *o = y * p);
                 } else {
@@ -132,6 +165,8 @@ fn source_along(
 
 /// Rays a block holds: its scratch rows stay in the first-level cache.
 const BLOCK: usize = 128;
+/// Rays whose exponentials are taken together; divides [`BLOCK`].
+const LANES: usize = 16;
 
 /// Carries every ray from the slice before to this one: `L <- L e^-x + J (1 - e^-x)`, x the optical depth between the
 /// slices and J the mean of a source that is linear in optical depth. A plain mean of both ends would be as good for
@@ -144,10 +179,11 @@ fn advance(
     shift: &Shift,
     sigma_t: [f32; 3],
     density: &[f32],
-    slice_source: &[Vec<f32>; 3],
+    slice_source: &SliceSource,
 ) {
     let slices = &path.slices;
     let weights = shift.ray_weights();
+    let source_weights = weights.map(|row| row.map(|w| w * slice_source.scale));
     let half = 0.5 * path.length;
     let grey = sigma_t[0] == sigma_t[1] && sigma_t[0] == sigma_t[2];
     let (mut met, mut depth, mut source, mut entering) = ([0.0; BLOCK], [0.0; BLOCK], [0.0; BLOCK], [false; BLOCK]);
@@ -171,21 +207,24 @@ fn advance(
             for channel in 0..3 {
                 if channel == 0 || !grey {
                     let sigma = sigma_t[channel];
-                    for c in 0..len {
-                        let x = sigma * depth[c];
-                        let (through, rest) = exp_neg_and_rest(x);
-                        let share = near_share(x, rest);
-                        (kept[c], near[c], far[c]) = (through, rest * share, rest - rest * share);
+                    // Whole vectors: what lies past `len` is scratch of an earlier block, and is not read.
+                    for lane in (0..len).step_by(LANES) {
+                        for c in lane..lane + LANES {
+                            let x = sigma * depth[c];
+                            let (through, rest) = exp_neg_and_rest(x);
+                            let share = near_share(x, rest);
+                            (kept[c], near[c], far[c]) = (through, rest * share, rest - rest * share);
+                        }
                     }
                     let opacity = &mut rays.opacity[channel][start + block..][..len];
                     for c in 0..len {
                         opacity[c] = opacity[c] * kept[c] + (near[c] + far[c]);
                     }
                 }
-                let planes = &slice_source[channel];
-                let low = &planes[row * slices.columns + block..][..len + 1];
-                let high = &planes[(row + 1) * slices.columns + block..][..len + 1];
-                stencil(&mut source[..len], low, high, weights);
+                let plane = slice_source.channels[channel];
+                let low = &plane[row * slice_source.stride + block..][..len + 1];
+                let high = &plane[(row + 1) * slice_source.stride + block..][..len + 1];
+                stencil(&mut source[..len], low, high, source_weights);
                 let before = &mut rays.source[channel][start + block..][..len];
                 let radiance = &mut rays.radiance[channel][start + block..][..len];
                 for c in 0..len {
@@ -233,10 +272,12 @@ fn deposit(
                     interpolate(&mut factor, &rays.depth);
                     interpolate(&mut opacity, &rays.opacity[channel]);
                     let sigma = sigma_t[channel];
-                    for c in 0..len {
-                        let sends = exp_neg_and_rest(sigma * factor[c]).1;
-                        // Where the rays are empty they carry no radiance either.
-                        factor[c] = sends / opacity[c].max(1e-30);
+                    for lane in (0..len).step_by(LANES) {
+                        for c in lane..lane + LANES {
+                            let sends = exp_neg_and_rest(sigma * factor[c]).1;
+                            // Where the rays are empty they carry no radiance either.
+                            factor[c] = sends / opacity[c].max(1e-30);
+                        }
                     }
                 }
                 interpolate(&mut reached, &rays.radiance[channel]);
