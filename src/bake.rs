@@ -23,11 +23,13 @@ pub fn run(args: &BakeArgs) -> Result<(), Failure> {
 
 fn bake(args: &BakeArgs) -> Result<(), Failure> {
     let (name, frames) = frames(args)?;
+    pipeline::check_output(&args.output, &frames)?;
+    let settings = settings(args, name);
+    settings.fit.bounds().map_err(|e| Failure::work(e.to_string()))?;
     let progress = Progress::start(args.progress, "reading frames", frames.len() as u64);
     let survey = survey(&frames, &args.grid, args.clamp, &|| progress.advance(1))?;
     progress.finish();
     report_clamped(&survey);
-    let settings = settings(args, name);
     if args.dry_run {
         return plan(args, &survey, &settings);
     }

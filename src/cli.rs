@@ -248,7 +248,7 @@ pub struct BakeArgs {
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
     /// Threads; the result does not depend on it [default: one for each core].
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = threads)]
     pub threads: Option<usize>,
     /// How progress is shown.
     #[arg(long, value_enum, default_value_t)]
@@ -281,7 +281,7 @@ pub struct RenderArgs {
     /// Order of the spherical harmonics of phase function and source radiance.
     #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u8).range(1..=6))]
     pub sh_order: u8,
-    /// Beams that an environment is cut into (route grid) [default: 96].
+    /// Beams that an environment is cut into (route grid) [default: 64].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=65536))]
     pub beams: Option<u32>,
     /// Voxels between nodes of single scattering (route grid) [default: 1, more in huge frames].
@@ -330,7 +330,7 @@ pub struct RenderArgs {
     #[arg(long)]
     pub float: bool,
     /// Threads; the result does not depend on it [default: one for each core].
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = threads)]
     pub threads: Option<usize>,
     /// How progress is shown.
     #[arg(long, value_enum, default_value_t)]
@@ -375,7 +375,7 @@ pub struct UnpackArgs {
     #[arg(long)]
     pub half: bool,
     /// Threads; the result does not depend on it [default: one for each core].
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = threads)]
     pub threads: Option<usize>,
     /// How progress is shown.
     #[arg(long, value_enum, default_value_t)]
@@ -388,7 +388,7 @@ pub struct DemoArgs {
     /// The folder to fill: the inputs, a pack, rendered frames and a contact sheet.
     pub output: PathBuf,
     /// Threads; the result does not depend on it [default: one for each core].
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = threads)]
     pub threads: Option<usize>,
     /// How progress is shown.
     #[arg(long, value_enum, default_value_t)]
@@ -429,7 +429,12 @@ fn exr_pattern(text: &str) -> Result<PathBuf, String> {
 }
 
 fn march_step(text: &str) -> Result<f64, String> {
-    positive(text).ok().filter(|&v| v <= 4.0).ok_or_else(|| "expected voxels above 0, up to 4".into())
+    let in_range = |v: &f64| (1.0 / 64.0..=4.0).contains(v);
+    positive(text).ok().filter(in_range).ok_or_else(|| "expected voxels from 1/64 to 4".into())
+}
+
+fn threads(text: &str) -> Result<usize, String> {
+    text.parse().ok().filter(|n| (1..=1024).contains(n)).ok_or_else(|| "expected 1 to 1024".into())
 }
 
 fn cutoff(text: &str) -> Result<f64, String> {

@@ -222,6 +222,8 @@ fn settings(args: &RenderArgs) -> Result<RenderSettings, Failure> {
     refuse(single && args.scatter_step.is_some(), "--scatter-step", "--order single")?;
     refuse(single && args.scatter_rings.is_some(), "--scatter-rings", "--order single")?;
     refuse(single && args.scatter_order.is_some(), "--scatter-order", "--order single")?;
+    let too_many = args.scatter_order.is_some_and(|order| order > args.sh_order);
+    refuse(too_many, "--scatter-order", "a smaller --sh-order")?;
     let route = match args.route {
         RouteChoice::Grid => {
             let with = "--route grid";
@@ -288,8 +290,6 @@ fn document(args: &RenderArgs, settings: &RenderSettings, scene: &Scene) -> Valu
             render["scatter_step"] = automatic(grid.multiple_step);
             render["scatter_rings"] = json!(grid.rings);
             render["scatter_order"] = json!(grid.multiple_order);
-            render["rings"] = json!(grid.rings);
-            render["multiple_order"] = json!(grid.multiple_order);
             render["tolerance"] = json!(grid.tolerance);
             render["iterations"] = json!(grid.iterations);
         }

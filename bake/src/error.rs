@@ -57,6 +57,28 @@ pub enum Error {
         /// The file.
         path: PathBuf,
     },
+    /// A folder has the name of the work folder and is not one.
+    #[error("{}: a folder that no bake made is in the way; move it, or choose another output", path.display())]
+    Foreign {
+        /// The folder.
+        path: PathBuf,
+    },
+    /// Another bake of the same output is under way.
+    #[error("{}: another bake writes to this output; wait for it, or choose another output", path.display())]
+    Busy {
+        /// The work folder.
+        path: PathBuf,
+    },
+    /// The output would replace something that is not to be replaced.
+    #[error("{}: output: found {found}, expected {expected}", path.display())]
+    Output {
+        /// The output.
+        path: PathBuf,
+        /// What is there.
+        found: &'static str,
+        /// What may be there.
+        expected: &'static str,
+    },
     /// An interrupted bake was made with other settings or from other files.
     #[error("{}: the interrupted bake there had {what}; bake without --resume to start again", path.display())]
     Resume {

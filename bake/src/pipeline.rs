@@ -17,6 +17,7 @@ use smoke_formats::pack::{
 };
 use smoke_formats::residual::ResidualCodes;
 use smoke_formats::residual::hash::{HashTable, MAX_FRAMES};
+use smoke_formats::sequence::SequenceFrame;
 use smoke_formats::volume::DensityGrid;
 use smoke_runtime::medium::gaussian_sum::gaussian_sum;
 use std::path::Path;
@@ -79,7 +80,7 @@ pub enum Event {
     Frame {
         /// What is known of it; sizes of the hash come later.
         record: FrameRecord,
-        /// How long it took; none for a frame that an interrupted bake had finished.
+        /// How long it took, in whichever bake; none if that was not kept.
         seconds: Option<Seconds>,
     },
     /// A tile of frames is laid out: its share of seconds goes to each frame's `hash`.
@@ -89,6 +90,27 @@ pub enum Event {
         /// Seconds for all of them.
         seconds: f64,
     },
+}
+
+/// Fails, before anything is read, if `output` cannot be what the bake writes: one of its own sources, a folder or a
+/// device, or in a folder that is not there.
+pub fn check_output(output: &Path, frames: &[SequenceFrame]) -> Result<()> {
+    let fail = |found, expected| Err(Error::Output { path: output.to_owned(), found, expected });
+    if output.file_name().is_none() {
+        return fail("no file name", "the name of a file");
+    }
+    let parent = output.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    if !parent.is_dir() {
+        return fail("a folder that does not exist", "a name in a folder that does");
+    }
+    if std::fs::metadata(output).is_ok_and(|m| !m.is_file()) {
+        return fail("a folder or a device", "a regular file or a new name");
+    }
+    let Ok(place) = output.canonicalize() else { return Ok(()) };
+    match frames.iter().any(|frame| frame.path.canonicalize().is_ok_and(|source| source == place)) {
+        true => fail("a frame of the sequence itself", "another file"),
+        false => Ok(()),
+    }
 }
 
 /// Bakes a surveyed sequence to the file `output`.
@@ -119,7 +141,7 @@ pub fn bake(
         };
         let encoded = match work.load(frame.number) {
             Some(done) => {
-                observe(Event::Frame { record: *done.record(), seconds: None });
+                observe(Event::Frame { record: *done.record(), seconds: work.load_seconds(frame.number) });
                 done
             }
             None => {
@@ -137,6 +159,7 @@ pub fn bake(
                 let start = Instant::now();
                 work.store(&encoded)?;
                 let seconds = Seconds { write: seconds.write + start.elapsed().as_secs_f64(), ..seconds };
+                work.store_seconds(frame.number, &seconds)?;
                 observe(Event::Frame { record: *encoded.record(), seconds: Some(seconds) });
                 encoded
             }
@@ -246,7 +269,7 @@ fn assemble(
                 match work.load(frame.number) {
                     Some(encoded) => frames.push(encoded),
                     None => {
-                        failed = Some(Error::Changed { path: Work::folder_of(&path) });
+                        failed = Some(Error::Changed { path: path.clone() });
                         return Err(smoke_formats::Error::invalid(&path, "work", "a frame lost", "all frames"));
                     }
                 }

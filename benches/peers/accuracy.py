@@ -169,7 +169,7 @@ FOOT = """
 - The grid route is the default because of these tables.
 - At the centres, direct and pointwise exponentials end nearly level: what is left is mostly the interpolation of source radiance between the centres, not the exponential. It grows with sigma_t, as the mean free path falls below a Gaussian's radius.
 - The paper's own pair, optimal-linear exponential and diffusion, is far too dark in this medium: its exponential is good to a mean depth of 0.5 (`exponential.rs`), and its equations are used as corrected in `diffusion.rs`.
-- The grid route is a few per cent too bright at g = 0.5, more than at g = 0."""
+- The grid route is about a per cent too bright: radiance is read between nodes as if it were linear, where it falls off exponentially. At g = 0.5 the phase function's fourth and later bands are missing too (`--sh-order`)."""
 
 if __name__ == "__main__":
     main()

@@ -54,6 +54,10 @@ impl Default for RenderSettings {
     }
 }
 
+/// Rays of one direction that the grid route carries at most: the cross-section of the sheared box. 2^24 rays of nine
+/// values are 600 MB, and allow a cube of 2,000 nodes a side or a column of 4,000 by 50 by 50.
+const MOST_RAYS: usize = 1 << 24;
+
 /// Why an image cannot be made.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum RenderError {
@@ -73,6 +77,14 @@ pub enum RenderError {
         "the frame has density but no Gaussians, expected at least 1 for the route through centres; use the grid route"
     )]
     NoGaussians,
+    /// A direction's rays through the grid would not fit into memory.
+    #[error(
+        "the frame's box of {dims:?} nodes is too long and thin for the grid route, expected (a + b) (a + c) of its sides to be at most {MOST_RAYS}; use the route through centres, or bake the far parts apart"
+    )]
+    TooLong {
+        /// Sides of the frame's field.
+        dims: [usize; 3],
+    },
     /// A setting out of range.
     #[error("{name}: found {found}, expected {expected}")]
     Setting {
@@ -133,7 +145,14 @@ impl Renderer {
     pub fn set_frame(&mut self, frame: Frame) -> Result<(), RenderError> {
         (self.source, self.shaded, self.loaded) = (None, None, None);
         let transport = match self.settings.route {
-            Route::Grid(settings) => Transport::Grid(GridTransport::new(settings)),
+            Route::Grid(settings) => {
+                let [nx, ny, nz] = frame.field.dims;
+                let rays = [(nx, ny, nz), (ny, nx, nz), (nz, nx, ny)].map(|(a, b, c)| (a + b) * (a + c));
+                if rays.iter().any(|&rays| rays > MOST_RAYS) {
+                    return Err(RenderError::TooLong { dims: frame.field.dims });
+                }
+                Transport::Grid(GridTransport::new(settings))
+            }
             Route::Centres(settings) => {
                 let placement = UnitPlacement::of(&frame).ok_or(RenderError::NotUniform)?;
                 if frame.gaussians.is_empty() && frame.field.max() > 0.0 {
@@ -231,8 +250,8 @@ fn check(settings: &RenderSettings) -> Result<(), RenderError> {
     };
     let march = settings.march;
     setting((1..=6).contains(&settings.sh_order), "SH order", settings.sh_order.to_string(), "1 to 6")?;
-    let step = (0.0..=4.0).contains(&march.step);
-    setting(step, "march step", march.step.to_string(), "voxels up to 4, or 0 to choose")?;
+    let step = march.step == 0.0 || (1.0 / 64.0..=4.0).contains(&march.step);
+    setting(step, "march step", march.step.to_string(), "1/64 to 4 voxels, or 0 to choose")?;
     setting((0.0..1.0).contains(&march.cutoff), "cutoff", march.cutoff.to_string(), "0 to below 1")?;
     setting((1..=64).contains(&march.samples), "samples", march.samples.to_string(), "1 to 64")?;
     if let Route::Grid(grid) = settings.route {
