@@ -12,6 +12,7 @@ mod layers;
 mod progress;
 mod render;
 mod seconds;
+mod staging;
 #[cfg(test)]
 mod testing;
 mod unpack;

@@ -5,18 +5,17 @@
 
 use crate::cli::{ExponentialChoice, MultipleChoice, RenderArgs, RouteChoice, ScatteringOrder as Order};
 use crate::progress::Progress;
+use crate::staging::{SceneChanges, Stage};
 use crate::{answer, failure::Failure};
 use clap::error::ErrorKind;
-use glam::{DVec3, Vec3};
 use serde_json::{Value, json};
 use smoke_formats::Error;
 use smoke_formats::image::{self, FrameMetadata, RenderedFrame, SamplePrecision};
 use smoke_formats::pack::Pack;
-use smoke_formats::scene::{self, Scene, Sky, UpAxis};
+use smoke_formats::scene::Scene;
 use smoke_formats::sequence::OutputNames;
 use smoke_runtime::camera::Camera;
 use smoke_runtime::film::Film;
-use smoke_runtime::light::{Environment, Light};
 use smoke_runtime::march::MarchSettings;
 use smoke_runtime::medium::frame::Frame;
 use smoke_runtime::renderer::{RenderSettings, Renderer, Route, Seconds};
@@ -24,7 +23,6 @@ use smoke_runtime::transport::ScatteringOrder;
 use smoke_runtime::transport::compensated::centres::exponential::Exponential;
 use smoke_runtime::transport::compensated::centres::route::{CentreSettings, MultipleScattering};
 use smoke_runtime::transport::compensated::grid::route::GridSettings;
-use smoke_runtime::transport::medium::MediumParameters;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -41,7 +39,7 @@ struct Report {
 /// Renders the frames, one after the other, each by all threads.
 pub fn run(args: &RenderArgs) -> Result<(), Failure> {
     let settings = settings(args)?;
-    let scene = scene(args)?;
+    let Stage { scene, medium, lights, camera } = Stage::read(&args.scene, &changes(args))?;
     let pack = Pack::open(&args.pack)?;
     let numbers: Vec<i32> = pack.frames().iter().map(|f| f.frame).collect();
     let frames = match &args.frames {
@@ -49,13 +47,6 @@ pub fn run(args: &RenderArgs) -> Result<(), Failure> {
         None => (0..numbers.len()).collect(),
     };
     let names = OutputNames::new(&args.output, frames.len())?;
-    let lights = lights(&scene, &args.scene)?;
-    let medium = &scene.medium;
-    let medium = MediumParameters {
-        sigma_t: medium.sigma_t.map(|v| v as f32),
-        albedo: medium.albedo.map(|v| v as f32),
-        g: medium.g as f32,
-    };
     let pool = rayon::ThreadPoolBuilder::new().num_threads(args.threads.unwrap_or(0)).build();
     let pool = pool.map_err(|e| Failure::work(format!("--threads: {e}")))?;
     let document = document(args, &settings, &scene);
@@ -68,7 +59,7 @@ pub fn run(args: &RenderArgs) -> Result<(), Failure> {
         for &position in &frames {
             let frame = numbers[position];
             let path = names.path(frame);
-            let report = one_frame(&pack, position, &mut renderer, &scene, &document, &path, args.float)?;
+            let report = one_frame(&pack, position, &mut renderer, (&scene, &camera), &document, &path, args.float)?;
             reports.push(report);
             progress.advance(1);
         }
@@ -98,7 +89,7 @@ fn one_frame(
     pack: &Pack,
     position: usize,
     renderer: &mut Renderer,
-    scene: &Scene,
+    (scene, camera): (&Scene, &Camera),
     document: &Value,
     path: &Path,
     float: bool,
@@ -111,7 +102,7 @@ fn one_frame(
     let start = Instant::now();
     renderer.set_frame(frame).map_err(failed)?;
     let prepared = start.elapsed().as_secs_f64();
-    let (film, mut seconds) = renderer.render(&Camera::from_pinhole(&scene.pinhole())).map_err(failed)?;
+    let (film, mut seconds) = renderer.render(camera).map_err(failed)?;
     seconds.source_radiance += prepared;
     let start = Instant::now();
     let clamped = write(pack, number, &film, scene, document, path, float)?;
@@ -156,56 +147,10 @@ fn fraction(fps: f64) -> Option<(i32, u32)> {
     })
 }
 
-/// The scene with what the command line changes, checked.
-fn scene(args: &RenderArgs) -> Result<Scene, Failure> {
-    let mut scene = Scene::read(&args.scene)?;
-    scene.medium.sigma_t = args.sigma_t.unwrap_or(scene.medium.sigma_t);
-    scene.medium.albedo = args.albedo.unwrap_or(scene.medium.albedo);
-    scene.medium.g = args.g.unwrap_or(scene.medium.g);
-    scene.width = args.width.unwrap_or(scene.width);
-    scene.height = args.height.unwrap_or(scene.height);
-    scene.validate(&args.scene)?;
-    Ok(scene)
-}
-
-/// The scene's lights for the renderer; reads the environment images.
-fn lights(scene: &Scene, path: &Path) -> Result<Vec<Light>, Failure> {
-    let light = |(i, light): (usize, &scene::Light)| match light {
-        scene::Light::Environment { sky, rotation_degrees, intensity, visible } => {
-            let factor = *intensity as f32;
-            let mut environment = match sky {
-                Sky::Color(color) => Environment::constant(color.map(|v| v as f32 * factor)),
-                Sky::Image { resolved, .. } => {
-                    let (image, negative) = image::read_environment(resolved)?;
-                    if negative > 0 {
-                        let file = resolved.display();
-                        eprintln!("smoke-bake: {file}: {negative} negative samples count as 0");
-                    }
-                    let radiance = image.pixels.iter().map(|p| p.map(|v| v * factor)).collect();
-                    Environment {
-                        width: image.width,
-                        height: image.height,
-                        radiance,
-                        ..Environment::constant([0.0; 3])
-                    }
-                }
-            };
-            environment.rotation = rotation_degrees.to_radians();
-            environment.up_is_y = scene.up == UpAxis::Y;
-            environment.visible = *visible;
-            Ok(Light::Environment(environment))
-        }
-        scene::Light::Directional { direction, irradiance } => {
-            let direction = DVec3::from_array(*direction);
-            let toward: Vec3 = -(direction / direction.abs().max_element()).normalize().as_vec3();
-            Ok(Light::Directional { toward, irradiance: irradiance.map(|v| v as f32) })
-        }
-        scene::Light::Point { .. } => {
-            let hint = "expected environment or directional: source radiance is solved for light from infinity only";
-            Err(Error::unsupported(path, format!("light[{i}].kind"), "point", hint).into())
-        }
-    };
-    scene.lights.iter().enumerate().map(light).collect()
+/// What the command line changes in the scene.
+fn changes(args: &RenderArgs) -> SceneChanges {
+    let RenderArgs { sigma_t, albedo, g, width, height, .. } = *args;
+    SceneChanges { sigma_t, albedo, g, width, height }
 }
 
 /// The dials, after a check that each given one applies.

@@ -68,7 +68,7 @@ fn new_frame(bencher: Bencher, g: f32) {
 fn new_lights(bencher: Bencher, g: f32) {
     let mut renderer = renderer(g);
     bencher.with_inputs(lights).bench_local_values(|lights| {
-        renderer.set_lights(lights);
+        renderer.set_lights(lights).unwrap();
         black_box(image(&mut renderer, &camera(0.0)))
     });
 }

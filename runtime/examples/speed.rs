@@ -62,7 +62,7 @@ fn measure(
             let start = Instant::now();
             match edit {
                 0 => renderer.set_frame(frame)?,
-                1 => renderer.set_lights(lights),
+                1 => renderer.set_lights(lights)?,
                 _ => camera.position.x += 1e-3,
             }
             let edited = start.elapsed().as_secs_f64();

@@ -74,6 +74,7 @@ fn blurred(lights: &[Light], g: f32, order: usize) -> Vec<[f32; 3]> {
                 let at = cell(toward.as_dvec3());
                 (0..3).for_each(|c| sky[at][c] += f64::from(irradiance[c]) / solid_angle(at));
             }
+            Light::Point { .. } => {}
         }
     }
     let half_way = order as f64 + std::f64::consts::LN_2 / -f64::from(g).ln();

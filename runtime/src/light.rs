@@ -1,4 +1,4 @@
-//! Lights at infinity: environments and suns, and their reduction to a bounded number of beams.
+//! Lights: environments and suns at infinity, points; and the reduction of those at infinity to a bounded number of beams.
 //!
 //! A *beam* is all the light of a solid angle sent along that solid angle's mean direction. An environment is cut into
 //! cells by repeated halving: the cell with the largest second moment `sum flux |w - mean|^2` is split, across its
@@ -119,7 +119,7 @@ impl Environment {
     }
 }
 
-/// A light at infinity.
+/// A light.
 #[derive(Clone, Debug)]
 pub enum Light {
     /// Light from the whole sphere.
@@ -130,6 +130,13 @@ pub enum Light {
         toward: Vec3,
         /// On a surface that faces the light.
         irradiance: [f32; 3],
+    },
+    /// An isotropic point, which no camera sees. Only methods that say so serve it.
+    Point {
+        /// World space, finite.
+        position: DVec3,
+        /// Radiant intensity, W/sr, finite, >= 0.
+        intensity: [f32; 3],
     },
 }
 
@@ -199,7 +206,7 @@ impl Cell {
     }
 }
 
-/// All lights as beams: one for each directional light, and at most `per_environment` for each environment.
+/// All lights at infinity as beams: one for each directional light, and at most `per_environment` for each environment.
 /// Beams without light are left out. The sum of their irradiances is the light's whole flux.
 pub fn beams(lights: &[Light], per_environment: usize) -> Vec<Beam> {
     let mut out = Vec::new();
@@ -207,6 +214,7 @@ pub fn beams(lights: &[Light], per_environment: usize) -> Vec<Beam> {
         match light {
             Light::Directional { toward, irradiance } => out.push(Beam { toward: *toward, irradiance: *irradiance }),
             Light::Environment(environment) => environment_beams(environment, per_environment.max(1), &mut out),
+            Light::Point { .. } => {}
         }
     }
     out.retain(|b| b.irradiance.iter().any(|&e| e > 0.0));

@@ -85,6 +85,14 @@ pub enum RenderError {
         /// Sides of the frame's field.
         dims: [usize; 3],
     },
+    /// Source radiance is solved for light from infinity only.
+    #[error(
+        "light[{index}]: found a point, expected environment or directional: the compensated method solves for light from infinity only; use --method reference"
+    )]
+    PointLight {
+        /// Which of the lights, from 0.
+        index: usize,
+    },
     /// A setting out of range.
     #[error("{name}: found {found}, expected {expected}")]
     Setting {
@@ -137,6 +145,7 @@ impl Renderer {
     pub fn new(settings: RenderSettings, medium: MediumParameters, lights: Vec<Light>) -> Result<Self, RenderError> {
         medium.check()?;
         check(&settings)?;
+        check_lights(&lights)?;
         let (beams, sky, loaded, source, shaded) = (None, None, None, None, None);
         Ok(Self { settings, medium, lights, beams, sky, loaded, source, shaded })
     }
@@ -171,9 +180,11 @@ impl Renderer {
     }
 
     /// Other lights.
-    pub fn set_lights(&mut self, lights: Vec<Light>) {
+    pub fn set_lights(&mut self, lights: Vec<Light>) -> Result<(), RenderError> {
+        check_lights(&lights)?;
         self.lights = lights;
         (self.beams, self.sky, self.source, self.shaded) = (None, None, None, None);
+        Ok(())
     }
 
     /// Another medium.
@@ -241,6 +252,11 @@ fn solve(
             (Box::new(CentreSource::new(transport.points().clone(), radiance, frame, *placement)), marched)
         }
     })
+}
+
+fn check_lights(lights: &[Light]) -> Result<(), RenderError> {
+    let point = lights.iter().position(|light| matches!(light, Light::Point { .. }));
+    point.map_or(Ok(()), |index| Err(RenderError::PointLight { index }))
 }
 
 fn check(settings: &RenderSettings) -> Result<(), RenderError> {

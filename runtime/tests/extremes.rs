@@ -280,7 +280,7 @@ fn edits_give_the_same_bits_as_a_fresh_start_and_so_does_any_number_of_threads()
         assert!(renderer.render(&camera(3.0)).unwrap().0.pixels.iter().all(|p| p.alpha() == 0.0), "no frame yet");
         renderer.set_frame(ball_with_gaussians()).unwrap();
         renderer.render(&camera(3.0)).unwrap();
-        renderer.set_lights(sun(Vec3::X));
+        renderer.set_lights(sun(Vec3::X)).unwrap();
         renderer.render(&camera(5.0)).unwrap();
         renderer.set_medium(last).unwrap();
         renderer.render(&camera(5.0)).unwrap();

@@ -42,6 +42,7 @@ pub fn incident(lights: &[Light], directions: &Directions, rings: usize, world_f
                 let q = cell(toward.as_dvec3());
                 (0..3).for_each(|c| radiance[q][c] += f64::from(irradiance[c]) / f64::from(directions.weights[q]));
             }
+            Light::Point { .. } => {}
         }
     }
     IncidentRadiance::Sampled(radiance.into_iter().map(|r| r.map(|v| v as f32)).collect())

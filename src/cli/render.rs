@@ -1,0 +1,148 @@
+//! Options of `render`.
+
+use super::{ProgressMode, Rgb, cutoff, exr_pattern, march_step, rgb, threads};
+use clap::{Args, ValueEnum};
+use smoke_formats::sequence::FrameSelection;
+use std::path::PathBuf;
+
+/// Which scattering orders are rendered.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum ScatteringOrder {
+    /// Light that was scattered once.
+    Single,
+    /// Light of all orders.
+    #[default]
+    All,
+}
+
+/// Where the source radiance is solved.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum RouteChoice {
+    /// On grid nodes.
+    #[default]
+    Grid,
+    /// At the Gaussians' centres, as Zhou et al. 2008 do.
+    Centres,
+}
+
+/// From optical depth to transmittance, at centres.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum ExponentialChoice {
+    /// True depths along directions; right at any depth.
+    #[default]
+    Direct,
+    /// Harmonics of the depth, exponentiated along directions; good to depth 3.
+    Pointwise,
+    /// Optimal linear with scaling and squaring; good to depth 1.
+    Hybrid,
+    /// Optimal linear, the paper's; good to depth 0.5.
+    Linear,
+}
+
+/// How light that scatters more than once is found.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum MultipleChoice {
+    /// Integral transport on grid nodes.
+    Transport,
+    /// Integral transport between centres.
+    Integral,
+    /// Diffusion between centres, the paper's, corrected.
+    Diffusion,
+}
+
+/// Options of `render`.
+#[derive(Args, Debug)]
+pub struct RenderArgs {
+    /// The pack.
+    pub pack: PathBuf,
+    /// The scene file.
+    #[arg(long, value_name = "SCENE")]
+    pub scene: PathBuf,
+    /// The images to write, such as out.####.exr; also %04d, $F4 or @@@@, or a plain name for one frame.
+    #[arg(short, long, value_name = "PATTERN", value_parser = exr_pattern)]
+    pub output: PathBuf,
+    /// Frames to render [default: all in the pack].
+    #[arg(long, value_name = "RANGE")]
+    pub frames: Option<FrameSelection>,
+    /// Where the source radiance is solved.
+    #[arg(long, value_enum, default_value_t)]
+    pub route: RouteChoice,
+    /// Scattering orders.
+    #[arg(long, value_enum, default_value_t)]
+    pub order: ScatteringOrder,
+    /// Order of the spherical harmonics of phase function and source radiance.
+    #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u8).range(1..=6))]
+    pub sh_order: u8,
+    /// Beams that an environment is cut into (route grid) [default: 64].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=65536))]
+    pub beams: Option<u32>,
+    /// Voxels between nodes of single scattering (route grid) [default: 1, more in huge frames].
+    #[arg(long, value_name = "VOXELS", value_parser = clap::value_parser!(u32).range(1..=64))]
+    pub source_step: Option<u32>,
+    /// Voxels between nodes of multiple scattering (route grid) [default: 2; 1 in thick smoke, more in huge frames].
+    #[arg(long, value_name = "VOXELS", value_parser = clap::value_parser!(u32).range(1..=64))]
+    pub scatter_step: Option<u32>,
+    /// Rings of directions that multiple scattering is gathered along; twice as many in azimuth [default: 5].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(2..=32))]
+    pub scatter_rings: Option<u8>,
+    /// Bands of the phase function that multiple scattering keeps, at most --sh-order [default: 3].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=6))]
+    pub scatter_order: Option<u8>,
+    /// From optical depth to transmittance (route centres) [default: direct].
+    #[arg(long, value_enum)]
+    pub exponential: Option<ExponentialChoice>,
+    /// Light scattered more than once [default: transport with route grid, integral with route centres].
+    #[arg(long, value_enum)]
+    pub multiple: Option<MultipleChoice>,
+    /// Voxels between samples along a ray [default: 1, less where the medium is thick].
+    #[arg(long, value_name = "VOXELS", value_parser = march_step)]
+    pub march_step: Option<f64>,
+    /// Transmittance below which a ray ends.
+    #[arg(long, value_name = "T", default_value_t = 0.001, value_parser = cutoff)]
+    pub cutoff: f64,
+    /// Rays along a side of a pixel: N x N rays a pixel.
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=64))]
+    pub samples: u8,
+    /// Instead of the scene's sigma_t: a number, or R,G,B.
+    #[arg(long, value_name = "RGB", value_parser = rgb)]
+    pub sigma_t: Option<Rgb>,
+    /// Instead of the scene's albedo: a number, or R,G,B.
+    #[arg(long, value_name = "RGB", value_parser = rgb)]
+    pub albedo: Option<Rgb>,
+    /// Instead of the scene's g.
+    #[arg(long, value_name = "COSINE", allow_negative_numbers = true)]
+    pub g: Option<f64>,
+    /// Instead of the scene's width.
+    #[arg(long, value_name = "PIXELS")]
+    pub width: Option<u32>,
+    /// Instead of the scene's height.
+    #[arg(long, value_name = "PIXELS")]
+    pub height: Option<u32>,
+    /// Store R, G, B, A in 32 bits instead of 16.
+    #[arg(long)]
+    pub float: bool,
+    /// Threads; the result does not depend on it [default: one for each core].
+    #[arg(long, value_name = "N", value_parser = threads)]
+    pub threads: Option<usize>,
+    /// How progress is shown.
+    #[arg(long, value_enum, default_value_t)]
+    pub progress: ProgressMode,
+    /// Print one JSON document with settings and seconds per stage and frame.
+    #[arg(long)]
+    pub json: bool,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::parse;
+    use super::*;
+
+    #[test]
+    fn render_takes_a_number_or_three_for_colours() {
+        let line = ["a.smoke", "--scene", "s.toml", "-o", "out.####.exr", "--sigma-t", "8", "--albedo", ".9,.8,.7"];
+        let args: RenderArgs = parse(&[&line[..], &["--g", "-0.5"]].concat()).unwrap();
+        assert_eq!((args.sigma_t, args.albedo, args.g), (Some([8.0; 3]), Some([0.9, 0.8, 0.7]), Some(-0.5)));
+        assert!(parse::<RenderArgs>(&[&line[..5], &["--sigma-t", "1,2"]].concat()).is_err());
+        assert!(parse::<RenderArgs>(&[&line[..5], &["--sh-order", "7"]].concat()).is_err());
+    }
+}
