@@ -3,12 +3,13 @@
 use crate::cli::{MethodChoice, RenderArgs};
 use crate::failure::Failure;
 use crate::staging::Stage;
-use crate::{compensated, reference};
+use crate::{compensated, plan, reference};
 use clap::error::ErrorKind;
 use serde_json::{Value, json};
+use smoke_formats::pack::Pack;
 use smoke_runtime::film::Film;
-use smoke_runtime::light::Light;
 use smoke_runtime::medium::frame::Frame;
+use smoke_runtime::plan::choose::Settings;
 use smoke_runtime::renderer::{RenderSettings, Renderer, Seconds};
 use smoke_runtime::transport::reference::{ReferenceSettings, trace};
 use std::time::Instant;
@@ -54,13 +55,30 @@ pub fn does_not_apply(given: bool, option: &str, with: &str) -> Result<(), clap:
 }
 
 impl Method {
-    /// The method that the options ask for; `stage` decides where they leave it open.
-    pub fn choose(args: &RenderArgs, stage: &Stage) -> Result<Self, Failure> {
-        let point = stage.lights.iter().any(|light| matches!(light, Light::Point { .. }));
+    /// The method that the options ask for. Where they leave it open the plan for the whole of `pack` decides, whichever
+    /// frames are rendered; then there is a line that tells what it chose.
+    pub fn choose(args: &RenderArgs, stage: &Stage, pack: &Pack) -> Result<(Self, Option<String>), Failure> {
+        let traced = |base| reference::settings(args, &base).map(Self::Reference);
+        let marched = |base| compensated::settings(args, &base).map(Self::Compensated);
+        if args.method != MethodChoice::Auto {
+            let with = "a --method other than auto";
+            does_not_apply(args.error.is_some(), "--error", with)?;
+            does_not_apply(args.time.is_some(), "--time", with)?;
+        }
         match args.method {
-            MethodChoice::Reference => reference::settings(args).map(Self::Reference),
-            MethodChoice::Auto if point => reference::settings(args).map(Self::Reference),
-            MethodChoice::Auto | MethodChoice::Compensated => compensated::settings(args).map(Self::Compensated),
+            MethodChoice::Reference => Ok((traced(ReferenceSettings::default())?, None)),
+            MethodChoice::Compensated => Ok((marched(RenderSettings::default())?, None)),
+            MethodChoice::Auto => {
+                let goal = plan::goal(args.error, args.time);
+                let plan = plan::of_pack(pack, None, stage, goal, args.threads)?.plan;
+                let method = match plan.settings {
+                    Settings::Compensated(settings) => marched(settings)?,
+                    Settings::Reference { target_error } => {
+                        traced(ReferenceSettings { target_error, ..ReferenceSettings::default() })?
+                    }
+                };
+                Ok((method, Some(plan.sentence())))
+            }
         }
     }
 

@@ -16,8 +16,8 @@ use crate::renderer::{RenderError, RenderSettings};
 /// Factor by which a predicted error must stay below the one asked: predictions are right to a factor of 2, and mostly
 /// to this (see `docs/decisions/033-plan.md`).
 pub const MARGIN: f64 = 1.5;
-/// Error that the reference is traced to where none is asked.
-pub const REFERENCE_ERROR: f64 = 0.01;
+/// Error that the reference is traced to where none is asked: its own default.
+pub const REFERENCE_ERROR: f64 = 0.02;
 /// Least and most error that the reference is asked for.
 const REFERENCE_RANGE: [f64; 2] = [1e-4, 1.0];
 

@@ -76,16 +76,19 @@ pub fn ladder() -> [Rung; 9] {
             "32 beams; multiple scattering every third voxel, 4 rings, 2 bands",
             all(4, 32, [1, 3], 4, 2, 1.0),
         ),
+        rung(
+            "middle",
+            "64 beams; multiple scattering every second voxel, 4 rings, 3 bands",
+            all(4, grid.beams, [0, 2], 4, 3, 0.0),
+        ),
         rung(DEFAULT, "64 beams; multiple scattering every second voxel or finer, 5 rings, 3 bands", base),
         rung(
             "fine",
-            "128 beams, 5 bands; multiple scattering at every voxel, 6 rings, 4 bands; half-voxel march",
-            all(5, 128, [1, 1], 6, 4, 0.5),
-        ),
-        rung(
-            "finest",
-            "256 beams, 6 bands; multiple scattering at every voxel, 8 rings, 6 bands; half-voxel march",
-            all(6, 256, [1, 1], 8, 6, 0.5),
+            "256 beams, 6 bands; multiple scattering at every voxel, 8 rings, 3 bands; half-voxel march, 4 rays a pixel",
+            RenderSettings {
+                march: MarchSettings { step: 0.5, samples: 2, ..base.march },
+                ..all(6, 256, [0, 1], 8, 3, 0.0)
+            },
         ),
         rung(
             "centres",

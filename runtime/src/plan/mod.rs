@@ -1,6 +1,7 @@
 //! Which method and which settings: surveys of a scene, predictions from measurements, and the choice.
 //!
-//! 1. [`medium_survey`], [`light_survey`] and [`view_survey`] put figures on a frame, its lights and its camera.
+//! 1. [`medium_survey`], [`light_survey`] and [`view_survey`] put figures on a frame, its lights and its camera;
+//!    [`over_time`] on a sequence.
 //! 2. [`methods`] says who can serve, [`ladder`] has their settings from coarse to fine, [`terms`] says what can be left
 //!    out.
 //! 3. [`table`] predicts error and seconds of every rung from measurements ([`work`] scales the seconds).
@@ -13,6 +14,7 @@ pub mod ladder;
 pub mod light_survey;
 pub mod medium_survey;
 pub mod methods;
+pub mod over_time;
 pub mod table;
 pub mod terms;
 pub mod view_survey;

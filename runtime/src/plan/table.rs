@@ -1,14 +1,14 @@
 //! Measured errors and seconds of the rungs over scenes, and what they predict for another scene.
 //!
-//! `measured.csv` is made by `smoke-bake sweep` (see its `--ladder`): a row is one rung on one scene, and the scenes are a
-//! full product of four axes: optical depth (95th percentile), |g|, albedo and directionality of the light. In
+//! `measured.csv` is made by `smoke-bake sweep` (see its `--ladder`): a row is one rung on one scene, and a rung's scenes are
+//! a full product of four axes: optical depth (95th percentile), |g|, albedo and directionality of the light. In
 //! `(ln depth, |g|, sqrt(1 - albedo), directionality)` the logarithms of the error and of the seconds per unit of work are
 //! interpolated linearly between the measured ones, and held constant beyond the outermost.
 //! `sqrt(1 - albedo)` because a thick medium's light falls off by it (diffusion: the root of `3 (1 - albedo)`).
 //! Cost: 16 cells a prediction.
 
 use super::Survey;
-use super::ladder::{Rung, ladder};
+use super::ladder::{Rung, rung};
 use super::work::{speedup, work};
 use std::collections::BTreeMap;
 use std::fmt;
@@ -126,13 +126,18 @@ pub struct Prediction {
 /// Logarithms of the error, and of the single-thread seconds per unit of work of the three stages.
 type Cell = [f64; 4];
 
-/// The cells of all rungs on the nodes of the axes.
+/// The measurements of one rung.
 #[derive(Clone, Debug)]
-pub struct Table {
+struct Measured {
+    /// Coordinates, ascending, along each axis.
     axes: [Vec<f64>; 4],
-    /// Rung, then node, the first axis fastest.
-    cells: BTreeMap<String, Vec<Cell>>,
+    /// A cell for each node of the axes' product, the first axis fastest.
+    cells: Vec<Cell>,
 }
+
+/// The measurements of all rungs, by name.
+#[derive(Clone, Debug)]
+pub struct Table(BTreeMap<String, Measured>);
 
 /// The table that the program predicts from.
 pub static MEASURED: LazyLock<Table> =
@@ -150,36 +155,60 @@ impl Table {
     /// The first line that is not a row; a rung that is not in the ladder; a node of the axes' product where a rung has
     /// no row, or two.
     pub fn parse(text: &str) -> Result<Self, String> {
-        let rows = rows(text)?;
+        let mut of_rungs: BTreeMap<String, Vec<Row>> = BTreeMap::new();
+        for row in rows(text)? {
+            of_rungs.entry(row.rung.clone()).or_default().push(row);
+        }
+        match of_rungs.keys().find(|name| rung(name).is_none()) {
+            Some(unknown) => Err(format!("rung {unknown}: not in the ladder")),
+            None => of_rungs
+                .into_iter()
+                .map(|(name, rows)| Ok((name, Measured::new(&rows)?)))
+                .collect::<Result<_, _>>()
+                .map(Self),
+        }
+    }
+
+    /// What `rung` is predicted to do on the scene of `survey` with `threads`; none for a rung that was not measured.
+    ///
+    /// The error is the largest of the three channels'. For the reference it is the noise at which it was stopped when it
+    /// was measured.
+    pub fn predict(&self, rung: &Rung, survey: &Survey, threads: usize) -> Option<Prediction> {
+        let measured = self.0.get(rung.name)?;
+        let (depth, albedo) = (survey.medium.depth_p95(), survey.medium.parameters.albedo.map(f64::from));
+        let (g, directionality) = (f64::from(survey.medium.parameters.g), survey.light.directionality());
+        let channels = [0, 1, 2].map(|c| measured.interpolate(coordinates(depth[c], g, albedo[c], directionality)));
+        let worst = |i: usize| channels.iter().map(|cell| cell[i]).fold(f64::NEG_INFINITY, f64::max).exp();
+        let work = work(rung, survey);
+        let seconds = [0, 1, 2].map(|s| worst(s + 1) * work[s] / speedup(threads));
+        Some(Prediction { error: worst(0) * survey.view.dilution, seconds })
+    }
+}
+
+impl Measured {
+    fn new(rows: &[Row]) -> Result<Self, String> {
         let place = |row: &Row| coordinates(row.depth, row.g, row.albedo, row.directionality);
-        let axis = |a: usize| {
+        let axes: [Vec<f64>; 4] = std::array::from_fn(|a| {
             let mut values: Vec<f64> = rows.iter().map(|row| place(row)[a]).collect();
             values.sort_by(f64::total_cmp);
             values.dedup();
             values
-        };
-        let axes = [0, 1, 2, 3].map(axis);
+        });
         let nodes: usize = axes.iter().map(Vec::len).product();
-        let mut cells: BTreeMap<String, Vec<Option<Cell>>> = BTreeMap::new();
-        for row in &rows {
-            if !ladder().iter().any(|rung| rung.name == row.rung) {
-                return Err(format!("rung {}: not in the ladder", row.rung));
-            }
+        let mut cells: Vec<Option<Cell>> = vec![None; nodes];
+        for row in rows {
             let place = place(row);
-            let at = (0..4)
-                .rev()
-                .fold(0, |at, a| at * axes[a].len() + axes[a].iter().position(|v| *v == place[a]).unwrap_or_default());
-            let cell = &mut cells.entry(row.rung.clone()).or_insert_with(|| vec![None; nodes])[at];
-            if cell.replace(Self::cell(row)).is_some() {
+            // Every coordinate is on its axis.
+            let along = |a: usize| axes[a].partition_point(|v| *v < place[a]);
+            let at = (0..4).rev().fold(0, |at, a| at * axes[a].len() + along(a));
+            if cells[at].replace(Self::cell(row)).is_some() {
                 return Err(format!("rung {}: two rows for {}", row.rung, row.scene));
             }
         }
-        let whole = |(name, cells): (String, Vec<Option<Cell>>)| {
-            let missing = cells.iter().filter(|cell| cell.is_none()).count();
-            let all: Option<Vec<Cell>> = cells.into_iter().collect();
-            all.map(|all| (name.clone(), all)).ok_or_else(|| format!("rung {name}: {missing} of {nodes} rows missing"))
-        };
-        Ok(Self { axes, cells: cells.into_iter().map(whole).collect::<Result<_, _>>()? })
+        let missing = cells.iter().filter(|cell| cell.is_none()).count();
+        let whole = cells.into_iter().collect::<Option<_>>();
+        let name = rows.first().map_or("", |row| &row.rung);
+        whole.map(|cells| Self { axes, cells }).ok_or_else(|| format!("rung {name}: {missing} of {nodes} rows missing"))
     }
 
     fn cell(row: &Row) -> Cell {
@@ -188,23 +217,7 @@ impl Table {
         [row.error.max(LEAST_ERROR).ln(), stage(0), stage(1), stage(2)]
     }
 
-    /// What `rung` is predicted to do on the scene of `survey` with `threads`; none for a rung that was not measured.
-    ///
-    /// The error is the largest of the three channels'. For the reference it is the noise at which it was stopped when it
-    /// was measured; see [`Self::reference`].
-    pub fn predict(&self, rung: &Rung, survey: &Survey, threads: usize) -> Option<Prediction> {
-        let cells = self.cells.get(rung.name)?;
-        let (depth, albedo) = (survey.medium.depth_p95(), survey.medium.parameters.albedo.map(f64::from));
-        let (g, directionality) = (f64::from(survey.medium.parameters.g), survey.light.directionality());
-        let channels = [0, 1, 2].map(|c| self.interpolate(cells, coordinates(depth[c], g, albedo[c], directionality)));
-        let worst = channels.into_iter().max_by(|a, b| a[0].total_cmp(&b[0]))?;
-        let work = work(rung, survey);
-        let slowest = |s: usize| channels.iter().map(|cell| cell[s + 1]).fold(f64::NEG_INFINITY, f64::max);
-        let seconds = [0, 1, 2].map(|s| slowest(s).exp() * work[s] / speedup(threads));
-        Some(Prediction { error: worst[0].exp() * survey.view.dilution, seconds })
-    }
-
-    fn interpolate(&self, cells: &[Cell], at: [f64; 4]) -> Cell {
+    fn interpolate(&self, at: [f64; 4]) -> Cell {
         let places: [(usize, usize, f64); 4] = std::array::from_fn(|a| {
             let axis = &self.axes[a];
             let last = axis.len() - 1;
@@ -223,7 +236,7 @@ impl Table {
                 node = node * self.axes[a].len() + if upper { high } else { low };
                 weight *= if upper { fraction } else { 1.0 - fraction };
             }
-            (0..4).for_each(|i| sum[i] += weight * cells[node][i]);
+            (0..4).for_each(|i| sum[i] += weight * self.cells[node][i]);
         }
         sum
     }
@@ -232,7 +245,7 @@ impl Table {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::plan::ladder::rung;
+    use crate::plan::ladder::ladder;
     use crate::plan::tests::survey;
 
     /// A table over 2 x 2 x 1 x 2 scenes: error = 0.01 depth (1 + g), seconds = work * 1e-6.
@@ -322,8 +335,8 @@ mod tests {
     fn the_measured_table_is_whole_and_has_every_rung() {
         let table = Table::parse(include_str!("measured.csv")).unwrap();
         for rung in ladder() {
-            assert!(table.cells.contains_key(rung.name), "{}", rung.name);
+            let axes = table.0.get(rung.name).map(|measured| &measured.axes);
+            assert!(axes.is_some_and(|axes| axes.iter().all(|axis| axis.len() >= 2)), "{}", rung.name);
         }
-        assert!(table.axes.iter().all(|axis| axis.len() >= 2));
     }
 }
