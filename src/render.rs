@@ -51,7 +51,7 @@ pub fn run(args: &RenderArgs) -> Result<(), Failure> {
     let names = OutputNames::new(&args.output, frames.len())?;
     let pool = rayon::ThreadPoolBuilder::new().num_threads(args.threads.unwrap_or(0)).build();
     let pool = pool.map_err(|e| Failure::work(format!("--threads: {e}")))?;
-    let (method, said) = pool.install(|| Method::choose(args, &stage, &pack))?;
+    let (method, said) = pool.install(|| Method::planned(args, &stage, &pack))?;
     if let Some(said) = said {
         eprintln!("smoke-bake: {said}");
     }

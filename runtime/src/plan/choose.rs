@@ -92,12 +92,12 @@ impl Plan {
     /// One line: what was chosen, what was left out and why.
     pub fn sentence(&self) -> String {
         let candidate = self.candidate();
-        let predicted =
-            candidate.prediction.map_or_else(String::new, |p| format!(" ({} error predicted)", percent(p.error)));
+        let error =
+            candidate.prediction.map_or_else(String::new, |p| format!("; predicted error {}", percent(p.error)));
         let left: Vec<String> =
             self.terms.iter().filter(|t| t.left_out).map(|t| format!("{} ({})", t.name, t.why)).collect();
         let left = if left.is_empty() { "nothing".to_owned() } else { left.join(", ") };
-        format!("{}{predicted}: {}; left out: {left}", candidate.rung.name, self.why)
+        format!("{}: {}{error}; left out: {left}", candidate.rung.name, self.why)
     }
 }
 
@@ -119,7 +119,7 @@ pub fn choose(survey: &Survey, goal: Goal, threads: usize, table: &Table) -> Pla
         Goal::Time(seconds) => for_time(&candidates, seconds),
     };
     let rung = candidates[chosen].rung;
-    let settings = match (rung.settings, goal) {
+    let settings = match (rung.settings_for(survey), goal) {
         (Some(settings), _) => Settings::Compensated(settings),
         (None, Goal::Error(error)) => Settings::Reference { target_error: error },
         (None, _) => {
@@ -164,7 +164,7 @@ fn best(survey: &Survey, candidates: &[Candidate]) -> (usize, String) {
                 let why = format!("multiple scattering is below {} of the single", percent(NOTHING));
                 (position(candidates, "single"), why)
             }
-            false => (default, "the default, as neither an error nor a time is asked".to_owned()),
+            false => (default, "the default, as no error and no time is asked".to_owned()),
         };
     }
     let centres = position(candidates, "centres");
@@ -180,8 +180,7 @@ fn for_error(candidates: &[Candidate], error: f64) -> (usize, String) {
     let by_seconds = |a: &usize, b: &usize| candidates[*a].seconds().total_cmp(&candidates[*b].seconds());
     let cheapest = (0..candidates.len()).filter(fast).filter(meets).min_by(by_seconds);
     if let Some(cheapest) = cheapest {
-        let predicted = percent(candidates[cheapest].error());
-        return (cheapest, format!("the cheapest of which {predicted} is predicted, {} asked", percent(error)));
+        return (cheapest, format!("the cheapest predicted to meet {}", percent(error)));
     }
     let by_error = |a: &usize, b: &usize| candidates[*a].error().total_cmp(&candidates[*b].error());
     let nearest = (0..candidates.len()).filter(fast).filter(|i| candidates[*i].prediction.is_some()).min_by(by_error);
@@ -190,11 +189,7 @@ fn for_error(candidates: &[Candidate], error: f64) -> (usize, String) {
         Some(nearest) => {
             let Candidate { rung, .. } = &candidates[nearest];
             let predicted = percent(candidates[nearest].error());
-            format!(
-                "of the fast methods {} comes nearest with {predicted} predicted, {} asked",
-                rung.name,
-                percent(error)
-            )
+            format!("{} asked, and of the fast methods {} comes nearest with {predicted}", percent(error), rung.name)
         }
     };
     (position(candidates, REFERENCE), why)

@@ -1,11 +1,12 @@
 //! Named settings of the methods, from the cheapest to the finest. Their errors and seconds are in the measured table,
 //! by name: a rung that changes needs measuring again (`smoke-bake sweep --ladder`).
 
+use super::Survey;
 use crate::march::MarchSettings;
 use crate::renderer::{RenderSettings, Route};
 use crate::transport::ScatteringOrder;
 use crate::transport::compensated::centres::route::CentreSettings;
-use crate::transport::compensated::grid::route::GridSettings;
+use crate::transport::compensated::grid::route::{GridSettings, least_multiple_step};
 
 /// One step of the ladder.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -33,6 +34,19 @@ impl Rung {
         }
     }
 
+    /// Its dials for the scene of `survey`: spacings that would be more nodes than fit into memory are left to the grid
+    /// route itself.
+    pub fn settings_for(&self, survey: &Survey) -> Option<RenderSettings> {
+        let mut settings = self.settings?;
+        if let Route::Grid(grid) = &mut settings.route {
+            let least = [survey.medium.steps[0], least_multiple_step(survey.medium.dims)];
+            for (step, least) in [&mut grid.single_step, &mut grid.multiple_step].into_iter().zip(least) {
+                *step = if *step < least { 0 } else { *step };
+            }
+        }
+        Some(settings)
+    }
+
     /// True if light scattered once is all that it has.
     pub fn is_single(&self) -> bool {
         self.settings.is_some_and(|s| s.scattering == ScatteringOrder::Single)
@@ -40,7 +54,7 @@ impl Rung {
 }
 
 /// All rungs; those of the grid from coarse to fine, then the other methods'.
-pub fn ladder() -> [Rung; 9] {
+pub fn ladder() -> [Rung; 10] {
     let base = RenderSettings::default();
     let grid = GridSettings::default();
     let rung = |name, words, settings| Rung { name, words, settings: Some(settings) };
@@ -66,6 +80,11 @@ pub fn ladder() -> [Rung; 9] {
     [
         rung("single-draft", "light scattered once, 16 beams, every second voxel", single(16, 2, 2.0)),
         rung("single", "light scattered once", single(grid.beams, 0, 0.0)),
+        rung(
+            "sketch",
+            "8 beams, every fourth voxel; multiple scattering every eighth voxel, 2 rings, 1 band",
+            all(2, 8, [4, 8], 2, 1, 2.0),
+        ),
         rung(
             "draft",
             "16 beams, every second voxel; multiple scattering every fourth voxel, 3 rings, 1 band",
@@ -117,6 +136,14 @@ mod tests {
         assert_eq!(rung(DEFAULT).unwrap().settings, Some(RenderSettings::default()));
         assert_eq!(rung(REFERENCE).unwrap().method(), "reference");
         assert_eq!(rung("centres").unwrap().method(), "centres");
+        let mut large = crate::plan::tests::survey(1.0, 0.9, 0.0);
+        let step = |survey: &Survey| match rung("fine").unwrap().settings_for(survey).unwrap().route {
+            Route::Grid(grid) => grid.multiple_step,
+            Route::Centres(_) => panic!("fine is of the grid"),
+        };
+        assert_eq!(step(&large), 1);
+        large.medium.dims = [500; 3];
+        assert_eq!(step(&large), 0);
         assert!(rung("single").unwrap().is_single() && rung("none").is_none());
     }
 }

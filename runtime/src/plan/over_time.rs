@@ -82,7 +82,7 @@ mod tests {
 
     #[test]
     fn few_frames_are_looked_at_whatever_the_length() {
-        assert_eq!(sampled(0, None), []);
+        assert!(sampled(0, None).is_empty());
         assert_eq!(sampled(1, Some(0)), [0]);
         assert_eq!(sampled(2, None), [0, 1]);
         assert_eq!(sampled(1001, Some(700)), [0, 500, 700, 1000]);
@@ -92,7 +92,7 @@ mod tests {
     fn ranges_are_extremes_and_means_and_the_thickest_is_the_first_of_equals() {
         let range = Range::of([3.0, 1.0, 5.0].into_iter());
         assert_eq!((range.least, range.mean, range.most), (1.0, 3.0, 5.0));
-        assert_eq!(Range::of([].into_iter()), Range { least: 0.0, mean: 0.0, most: 0.0 });
+        assert_eq!(Range::of(std::iter::empty::<f64>()), Range { least: 0.0, mean: 0.0, most: 0.0 });
         let mut surveys = vec![survey(2.0, 0.9, 0.0); 3];
         surveys[0].medium.column_p95 = 0.5;
         surveys[1].medium.column_p95 = 4.0;

@@ -169,6 +169,11 @@ impl Table {
         }
     }
 
+    /// The error that the rung called `rung` is predicted to make on a scene at this place of the axes, no sky visible.
+    pub fn error_at(&self, rung: &str, depth: f64, g: f64, albedo: f64, directionality: f64) -> Option<f64> {
+        Some(self.0.get(rung)?.interpolate(coordinates(depth, g, albedo, directionality))[0].exp())
+    }
+
     /// What `rung` is predicted to do on the scene of `survey` with `threads`; none for a rung that was not measured.
     ///
     /// The error is the largest of the three channels'. For the reference it is the noise at which it was stopped when it
@@ -290,7 +295,7 @@ mod tests {
         let work = work(&default, &survey);
         (0..3).for_each(|s| assert!((one[s] / (work[s] * 1e-6) - 1.0).abs() < 1e-6, "{one:?} {work:?}"));
         assert!(table.predict(&default, &survey, 4).unwrap().seconds[0] < one[0] / 2.5);
-        assert_eq!(table.predict(&rung("finest").unwrap(), &survey, 1), None);
+        assert_eq!(table.predict(&rung("centres").unwrap(), &survey, 1), None);
     }
 
     #[test]

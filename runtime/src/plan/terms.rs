@@ -46,57 +46,39 @@ pub fn terms(survey: &Survey, rung: &Rung, without_multiple: Option<f64>) -> Vec
     let parameters = medium.parameters;
     let depth = medium.depth_p95().into_iter().fold(0.0, f64::max);
     let albedo = parameters.albedo.into_iter().fold(0.0, f32::max);
-    let measured = without_multiple
-        .map_or_else(String::new, |error| format!("; without it the predicted error is {}", percent(error)));
+    let measured = without_multiple.map_or_else(String::new, |error| format!(", error without it {}", percent(error)));
+    let bound = percent(multiple_over_single(survey));
     let g = parameters.g;
-    let grey = medium.is_grey() && survey.light.grey;
+    let bands = settings.sh_order;
     let mut out = vec![
         term(
             "multiple scattering",
             rung.is_single(),
-            format!(
-                "optical depth {depth:.3} at the 95th percentile and albedo {albedo:.3}: at most about {} of the single{measured}",
-                percent(multiple_over_single(survey)),
-            ),
+            format!("optical depth {depth:.3}, albedo {albedo:.3}: at most about {bound} of the single{measured}"),
         ),
-        term(
-            "phase convolution",
-            g == 0.0,
-            if g == 0.0 {
-                "g is 0: scattering is isotropic, one band is all there is".to_owned()
-            } else {
-                format!("g is {g}: {} bands", settings.sh_order)
-            },
-        ),
-        term(
-            "forward peak",
-            g <= PLAIN_LIMIT,
-            if g <= PLAIN_LIMIT {
-                format!("g is {g}, at most {PLAIN_LIMIT}: the bands hold the phase function")
-            } else {
-                format!("g is {g}, above {PLAIN_LIMIT}: part of the peak counts as not scattered")
-            },
-        ),
-        term(
-            "sky behind the smoke",
-            !survey.light.visible,
-            match survey.light.visible {
-                true => format!("a sky is visible; beside it errors count {}", percent(survey.view.dilution)),
-                false => "no sky is visible to the camera".to_owned(),
-            },
-        ),
-        term(
-            "transfer bake",
-            true,
-            "lights from infinity are solved for directly; a bake pays only where they change and the medium does not"
-                .to_owned(),
-        ),
+        match g {
+            0.0 => term("phase convolution", true, "g is 0".to_owned()),
+            _ => term("phase convolution", false, format!("g is {g}: {bands} bands")),
+        },
+        match g > PLAIN_LIMIT {
+            true => term("forward peak", false, format!("g is {g}, above {PLAIN_LIMIT}: beyond the bands")),
+            false => term("forward peak", true, format!("g is at most {PLAIN_LIMIT}")),
+        },
+        match survey.light.visible {
+            true => {
+                let dilution = percent(survey.view.dilution);
+                term("sky behind the smoke", false, format!("visible; beside it errors count {dilution}"))
+            }
+            false => term("sky behind the smoke", true, "not visible".to_owned()),
+        },
+        term("transfer bake", true, "the lights of the scene are solved for directly".to_owned()),
     ];
     if let Some(fit_error) = survey.fit_error {
         let rms = fit_error.sqrt();
         let why = format!("the Gaussians alone are off by {} of the density's RMS", percent(rms));
         out.push(term("residual", false, why));
     }
+    let grey = medium.is_grey() && survey.light.grey;
     let coloured = match (medium.is_grey(), survey.light.grey) {
         (true, true) => "medium and lights are grey: the three channels are equal",
         (false, _) => "the medium has a colour",
@@ -153,7 +135,7 @@ mod tests {
         assert!(left(&plain, "phase convolution") && left(&plain, "two of three channels"));
         assert!(left(&plain, "forward peak") && left(&plain, "sky behind the smoke"));
         assert!(!left(&plain, "multiple scattering") && left(&of(&scene, "single"), "multiple scattering"));
-        assert!(term(&plain, "multiple scattering").why.contains("4.0 %"), "{plain:?}");
+        assert!(term(&plain, "multiple scattering").why.ends_with("error without it 4.0 %"), "{plain:?}");
         scene.medium.parameters.g = 0.8;
         scene.medium.parameters.albedo[1] = 0.8;
         scene.light.visible = true;

@@ -72,7 +72,12 @@ pub fn multiple_step(field: &DensityField, sigma_t: f32) -> usize {
     let voxel = field.world_from_node.matrix3.determinant().abs().cbrt();
     let depth = if count == 0 { 0.0 } else { sum / count as f64 * voxel * f64::from(sigma_t) };
     let finest = if depth > 0.2 { 1 } else { 2 };
-    (finest..).find(|step| nodes(field.dims, *step) <= MOST_MULTIPLE_NODES).unwrap_or(2)
+    least_multiple_step(field.dims).max(finest)
+}
+
+/// The finest spacing of the multiple-scattering nodes, in voxels, whose nodes stay below [`MOST_MULTIPLE_NODES`].
+pub fn least_multiple_step(dims: [usize; 3]) -> usize {
+    (1..).find(|step| nodes(dims, *step) <= MOST_MULTIPLE_NODES).unwrap_or(2)
 }
 
 /// Nodes `step` >= 1 voxels apart that a field of `dims` nodes is solved on.
