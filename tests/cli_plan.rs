@@ -21,6 +21,9 @@ static BAKED: LazyLock<tempfile::TempDir> = LazyLock::new(|| {
     let sky = "[[light]]\nkind = \"environment\"\ncolor = [0.4, 0.6, 1.0]\n";
     let point = "[[light]]\nkind = \"point\"\nposition = [2, 0, 1]\nintensity = 10\n";
     scene("sky.toml", sky);
+    let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("testdata/scenes/sunset.exr");
+    std::fs::copy(shipped, folder.path().join("sunset.exr")).unwrap();
+    scene("sunset.toml", "[[light]]\nkind = \"environment\"\nimage = \"sunset.exr\"\n");
     scene("point.toml", &format!("{sky}{point}"));
     scene("dark.toml", "");
     folder
@@ -45,7 +48,7 @@ fn render(scene: &str, more: &[&str]) -> (String, Vec<u8>) {
 #[test]
 fn thin_middle_and_thick_smoke_and_a_point_light_get_different_plans_each_with_its_reason() {
     let mut chosen = Vec::new();
-    for (scene, sigma_t) in [("sky.toml", "0.2"), ("sky.toml", "4"), ("sky.toml", "40"), ("point.toml", "4")] {
+    for (scene, sigma_t) in [("sunset.toml", "0.2"), ("sunset.toml", "4"), ("sunset.toml", "40"), ("point.toml", "4")] {
         let json = plan(scene, &["--sigma-t", sigma_t, "--error", "5%"]);
         let (rung, why) = (json["choice"]["rung"].as_str().unwrap(), json["choice"]["why"].as_str().unwrap());
         let of_rung = json["candidates"].as_array().unwrap().iter().find(|c| c["rung"] == rung).unwrap();
@@ -54,11 +57,10 @@ fn thin_middle_and_thick_smoke_and_a_point_light_get_different_plans_each_with_i
         assert!(why.contains("5.0 %") || why.contains("found a point"), "{why}");
         chosen.push(rung.to_owned());
     }
-    println!("{chosen:?}");
     assert_eq!(chosen[3], "reference");
     // From thin to thick more has to be computed.
     let seconds = |sigma_t: &str, rung: &str| {
-        let json = plan("sky.toml", &["--sigma-t", sigma_t, "--error", "5%"]);
+        let json = plan("sunset.toml", &["--sigma-t", sigma_t, "--error", "5%"]);
         let of_rung = json["candidates"].as_array().unwrap().iter().find(|c| c["rung"] == rung).unwrap().clone();
         of_rung["seconds"]["all"].as_f64().unwrap()
     };
