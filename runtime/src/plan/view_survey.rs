@@ -174,9 +174,10 @@ mod tests {
     #[test]
     fn a_visible_sky_dilutes_the_error_of_thin_smoke_and_not_of_thick() {
         // Smoke of albedo 1 under a sky of 1: S = 1 - T and B = T, together 1. Over a disc chords c of a ball of radius 1
-        // have the density c / 2: the mean of (1 - e^-c)^2 is 1/2 (2 - 2 (1 - 3 e^-2) + (1 - 5 e^-4) / 4), its root 0.721.
+        // have the density c / 2: the mean of (1 - e^-c)^2 is 1/2 (2 - 2 (1 - 3 e^-2) + (1 - 5 e^-4) / 4), its root 0.721;
+        // the trilinear edge adds rays to the disc, 5 % of its area, that see next to nothing.
         let middle = survey(1.0, true, DVec3::ZERO).dilution;
-        assert!((middle / 0.721 - 1.0).abs() < 0.04, "{middle}");
+        assert!((middle / 0.721 - 1.0).abs() < 0.06, "{middle}");
         assert_eq!(survey(0.01, true, DVec3::ZERO).dilution, LEAST_DILUTION);
         assert!(survey(1e3, true, DVec3::ZERO).dilution > 0.97);
     }
