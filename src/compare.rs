@@ -4,7 +4,7 @@ use crate::cli::CompareArgs;
 use crate::{answer, failure::Failure};
 use serde_json::{Value, json};
 use smoke_formats::image::{self, Channel, FloatImage, RgbImage};
-use smoke_runtime::image_difference::{self, Difference, Figures, Pair};
+use smoke_runtime::image_difference::{self, Difference, Figures, Pair, false_colour};
 use std::fmt::Write;
 use std::path::Path;
 
@@ -58,7 +58,7 @@ fn mask(args: &CompareArgs, test: &FloatImage, reference: &FloatImage) -> Result
 fn write_difference(path: &Path, pair: &Pair<'_>, scale: f64) -> Result<(), Failure> {
     let (width, height) = (pair.width, pair.test.len() / pair.width);
     if is_png(path) {
-        let pixels = image_difference::false_colour(pair, scale).map_err(|e| Failure::work(e.to_string()))?;
+        let pixels = false_colour::signed(pair, scale).map_err(|e| Failure::work(e.to_string()))?;
         return Ok(image::write_png(path, &RgbImage { width, height, pixels })?);
     }
     let difference = |c: usize| pair.test.iter().zip(pair.reference).map(|(a, b)| a[c] - b[c]).collect();
