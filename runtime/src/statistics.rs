@@ -33,7 +33,7 @@ pub fn student_tail(t: f64, freedom: f64) -> f64 {
         return 0.0;
     }
     if freedom >= NORMAL_FROM {
-        // Wallace 1959, section 3; what is left is of order 1/v^2.
+        // Wallace 1959; what is left is of order 1/v^2.
         let (ratio, square) = if freedom < f64::INFINITY {
             ((8.0 * freedom + 1.0) / (8.0 * freedom + 3.0), freedom * (square / freedom).ln_1p())
         } else {

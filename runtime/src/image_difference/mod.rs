@@ -24,6 +24,7 @@
 
 pub mod debiased;
 pub mod false_colour;
+pub mod flip;
 pub mod z_test;
 
 #[cfg(test)]

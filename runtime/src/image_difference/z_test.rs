@@ -16,7 +16,7 @@
 //! n - 1 degrees of freedom, or those of Welch (1947) and Satterthwaite (1946),
 //! `(s_a^2 + s_b^2)^2 / (s_a^4 / (n_a - 1) + s_b^4 / (n_b - 1))`, sums over all pixels for the mean. With 8 passes 8.6 % of
 //! the pixels lie beyond 2, not 4.6 %. The count of pixels with unequal probabilities is bounded by the binomial of their
-//! mean (Hoeffding 1956, theorem 4). Pixels have to be independent: one pixel wide filters.
+//! mean (Hoeffding 1956). Pixels have to be independent: one pixel wide filters.
 //!
 //! The channels of a pixel come from the same light paths. Their mean is tested as if they moved together, with a
 //! standard error of `(s_R + s_G + s_B) / 3`: the largest that it can have, so this row can only be too lenient.
