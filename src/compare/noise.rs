@@ -41,7 +41,7 @@ pub fn of(
         None => match LAYERS.map(|layer| image.channel(layer)) {
             [Some(r), Some(g), Some(b)] => r.iter().zip(g).zip(b).map(|((&r, &g), &b)| [r, g, b]).collect(),
             _ if passes.is_some() => {
-                return Err(missing(path, "passes").into());
+                return Err(missing(path, "--passes").into());
             }
             _ => return Ok(None),
         },

@@ -30,20 +30,18 @@ pub struct Report<'a> {
 impl Report<'_> {
     /// One line on what failed in the z-test; none if it passed or was not asked for.
     pub fn failed_z_test(&self) -> Option<String> {
-        let test = self.z_test.as_ref()?;
-        let mut failed = Vec::new();
-        for (name, f) in CHANNELS.iter().zip(&test.channels).chain([(&"R+G+B", &test.all)]) {
-            failed.extend(f.failed().into_iter().map(|part| match part {
-                Part::Mean => format!("mean of {name} ({:+.2} standard errors)", f.mean.z),
-                Part::Share => format!(
-                    "share beyond 2 in {name} ({:.2} %, {:.2} % pass)",
-                    100.0 * f.share.share,
-                    100.0 * f.share.bound
-                ),
-                Part::Exact => format!("{} pixels without noise in {name} that are not equal", f.unequal),
-            }));
-        }
-        (!failed.is_empty()).then(|| format!("z-test failed: {}", failed.join(", ")))
+        let test = self.z_test.as_ref().filter(|test| !test.passed())?;
+        let parts = [
+            (Part::Mean, "mean of"),
+            (Part::Share, "share beyond 2 standard errors in"),
+            (Part::Exact, "pixels without noise in"),
+        ];
+        let failed = parts.iter().filter_map(|(part, name)| {
+            let rows = CHANNELS.iter().zip(&test.channels).chain([(&"R+G+B", &test.all)]);
+            let rows: Vec<&str> = rows.filter(|(_, f)| f.failed().contains(part)).map(|(row, _)| *row).collect();
+            (!rows.is_empty()).then(|| format!("{name} {}", rows.join(", ")))
+        });
+        Some(format!("z-test failed: {}", failed.collect::<Vec<_>>().join("; ")))
     }
 
     /// A table for people.
