@@ -331,3 +331,21 @@ fn two_references_of_the_plume_differ_and_one_equals_itself() {
     // Single scattering lacks more than a tenth of the light of a plume with albedo 0.92.
     assert!(compare("plume_1040_single.exr", "plume_1040.exr") > 0.1);
 }
+
+#[test]
+#[ignore = "needs ../shared/data"]
+fn the_noise_and_the_flip_of_the_plumes_references_are_what_others_measured() {
+    let data = std::env::var_os("SMOKE_BAKE_DATA")
+        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), Into::into);
+    let references = data.join("../peers/references");
+    let line = ["--standard-error", "plume_1040.std.exr", "--z-test", "--flip", "--json"];
+    let compare = |image: &str| smoke_bake(&references, &[&["compare", image, "plume_1040.exr"], &line[..]].concat());
+    let found = json(&compare("plume_1040_single.exr"));
+    let number = |pointer: &str| found.pointer(pointer).unwrap().as_f64().unwrap();
+    // flip-evaluator 1.7 at 67 pixels per degree, 2 exposures from 1.8865242 to 2.6354589 stops.
+    assert!((number("/flip/mean") - 0.083_258_5).abs() < 1e-5, "{}", number("/flip/mean"));
+    // The renderer printed a relative standard error of 1.0 %.
+    assert!((number("/debiased/all/reference_noise") - 0.0101).abs() < 5e-5);
+    assert_eq!(found["z_test"]["passed"].as_bool(), Some(false));
+    assert_eq!(compare("plume_1040.exr").status.code(), Some(0));
+}

@@ -49,7 +49,7 @@ pub fn student_tail(t: f64, freedom: f64) -> f64 {
 pub fn binomial_tail(k: u64, n: u64, p: f64) -> f64 {
     match k {
         0 => 1.0,
-        k if k > n || !(p > 0.0) => 0.0,
+        k if k > n || p <= 0.0 || p.is_nan() => 0.0,
         _ if p >= 1.0 => 1.0,
         k => incomplete_beta(k as f64, (n - k) as f64 + 1.0, p, 1.0 - p),
     }

@@ -31,7 +31,7 @@ pub fn signed(pair: &Pair<'_>, scale: f64) -> Result<Vec<[f32; 3]>, Incomparable
 /// `0.97 v`, at chroma `0.16 sin(pi v)` and hues from 280 to 460 degrees, the largest round numbers that stay inside
 /// Rec.709 all the way. Beyond 1 it is 1, below 0 and NaN it is 0.
 pub fn ramp(value: f32) -> [f32; 3] {
-    let v = f64::from(value).max(0.0).min(1.0);
+    let v = if value > 0.0 { f64::from(value).min(1.0) } else { 0.0 };
     let (lightness, chroma) = (0.97 * v, 0.16 * (std::f64::consts::PI * v).sin());
     let (sine, cosine) = (280.0 + 180.0 * v).to_radians().sin_cos();
     let (a, b) = (chroma * cosine, chroma * sine);

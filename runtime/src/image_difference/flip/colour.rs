@@ -64,12 +64,13 @@ pub struct Metric {
     largest: f32,
 }
 
-impl Metric {
-    /// Takes the largest distance from green and blue.
-    pub fn new() -> Self {
+impl Default for Metric {
+    fn default() -> Self {
         Self { largest: distance(perceived([0.0, 1.0, 0.0]), perceived([0.0, 0.0, 1.0])) }
     }
+}
 
+impl Metric {
     /// From 0, the same, to 1, green and blue.
     pub fn difference(&self, a: [f32; 3], b: [f32; 3]) -> f32 {
         let (found, knee) = (distance(a, b), KNEE * self.largest);
@@ -110,7 +111,7 @@ mod tests {
 
     #[test]
     fn the_difference_is_0_for_equal_and_1_for_green_and_blue_and_monotone_over_the_knee() {
-        let metric = Metric::new();
+        let metric = Metric::default();
         let [green, blue] = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]].map(perceived);
         assert_eq!((metric.difference(green, green), metric.difference(green, blue)), (0.0, 1.0));
         let mut before = 0.0;

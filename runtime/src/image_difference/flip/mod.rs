@@ -61,7 +61,7 @@ pub struct FlipFigures {
 /// holds all.
 pub fn flip(pair: &Pair<'_>, pixels_per_degree: f64) -> Result<Flip, Incomparable> {
     check(&Pair { mask: None, ..*pair })?;
-    let (filters, metric) = (Filters::new(pixels_per_degree), Metric::new());
+    let (filters, metric) = (Filters::new(pixels_per_degree), Metric::default());
     let (exposures, count) = exposures(pair.reference);
     let mut errors = vec![0.0f32; pair.test.len()];
     for i in 0..count {
@@ -292,8 +292,8 @@ mod tests {
 
     #[test]
     fn extremes_give_errors_from_0_to_1_and_poison_is_refused() {
-        let mut reference = vec![[1e-38, 1.0, f32::MAX], [-5.0, 0.0, 1e-45]].repeat(WIDTH);
-        let test = vec![[f32::MAX, 0.0, 0.0], [f32::MAX, 1e-45, -f32::MAX]].repeat(WIDTH);
+        let mut reference = [[1e-38, 1.0, f32::MAX], [-5.0, 0.0, 1e-45]].repeat(WIDTH);
+        let test = [[f32::MAX, 0.0, 0.0], [f32::MAX, 1e-45, -f32::MAX]].repeat(WIDTH);
         for pixels_per_degree in [1.0, 67.0, 1000.0] {
             let found = flip(&pair(&test, &reference), pixels_per_degree).unwrap();
             assert!(found.errors.iter().all(|e| (0.0..=1.0).contains(e)));
