@@ -3,6 +3,7 @@
 
 pub mod backdrop;
 pub mod camera;
+pub mod error_function;
 pub mod film;
 pub mod image_difference;
 pub mod lanes;
@@ -11,4 +12,5 @@ pub mod march;
 pub mod medium;
 pub mod renderer;
 pub mod sphere;
+pub mod statistics;
 pub mod transport;
