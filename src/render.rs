@@ -212,6 +212,7 @@ fn settings(args: &RenderArgs) -> Result<RenderSettings, Failure> {
         step: args.march_step.unwrap_or(0.0) as f32,
         cutoff: args.cutoff as f32,
         samples: usize::from(args.samples),
+        half_resolution: args.half_resolution,
     };
     Ok(RenderSettings { route, sh_order: usize::from(args.sh_order), scattering, march })
 }
@@ -225,6 +226,7 @@ fn document(args: &RenderArgs, settings: &RenderSettings, scene: &Scene) -> Valu
         "march_step": args.march_step.map_or(json!("automatic"), |step| json!(step)),
         "cutoff": args.cutoff,
         "samples": args.samples,
+        "half_resolution": args.half_resolution,
     });
     match settings.route {
         Route::Grid(grid) => {

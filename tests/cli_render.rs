@@ -49,7 +49,9 @@ fn read(folder: &Path, name: &str) -> FloatImage {
 
 #[test]
 fn a_frame_alone_in_a_sequence_and_on_any_number_of_threads_has_the_same_bytes() {
-    for dials in [&["--g", "0.7"][..], &["--route", "centres"], &["--order", "single", "--samples", "2"]] {
+    for dials in
+        [&["--g", "0.7"][..], &["--route", "centres"], &["--order", "single", "--samples", "2"], &["--half-resolution"]]
+    {
         let (all, _) = render(SUNSET, "out.####.exr", &[dials, &["--threads", "1"]].concat());
         let (one, _) = render(SUNSET, "out.%04d.exr", &[dials, &["--threads", "3", "--frames", "8"]].concat());
         let bytes = |folder: &Path, name: &str| std::fs::read(folder.join(name)).unwrap();
@@ -110,6 +112,7 @@ fn every_dial_changes_the_image_and_a_scene_may_have_y_up() {
         &["--march-step", "0.5"],
         &["--cutoff", "0.2"],
         &["--samples", "2"],
+        &["--half-resolution"],
         &["--albedo", "0.5"],
     ] {
         assert!(picture(plain, &[&["--g", "0.4", "--sigma-t", "5"], dials].concat()) != default, "{dials:?}");

@@ -4,6 +4,7 @@
 pub mod backdrop;
 pub mod camera;
 pub mod film;
+mod half_resolution;
 pub mod image_difference;
 pub mod lanes;
 pub mod light;

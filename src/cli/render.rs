@@ -103,6 +103,9 @@ pub struct RenderArgs {
     /// Rays along a side of a pixel: N x N rays a pixel.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=64))]
     pub samples: u8,
+    /// March one ray for every 2 x 2 pixels, and more only where those differ.
+    #[arg(long)]
+    pub half_resolution: bool,
     /// Instead of the scene's sigma_t: a number, or R,G,B.
     #[arg(long, value_name = "RGB", value_parser = rgb)]
     pub sigma_t: Option<Rgb>,
