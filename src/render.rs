@@ -3,7 +3,7 @@
 //! Every frame is made from the pack, the scene and the settings alone, never from another frame: one frame or all, one
 //! thread or many, the bytes are the same. All settings go into each image's `smokebake:settings`.
 
-use crate::cli::{ExponentialChoice, MultipleChoice, RenderArgs, RouteChoice, ScatteringOrder as Order};
+use crate::cli::{Detail, ExponentialChoice, MultipleChoice, RenderArgs, RouteChoice, ScatteringOrder as Order};
 use crate::progress::Progress;
 use crate::staging::{SceneChanges, Stage};
 use crate::{answer, failure::Failure};
@@ -59,7 +59,7 @@ pub fn run(args: &RenderArgs) -> Result<(), Failure> {
         for &position in &frames {
             let frame = numbers[position];
             let path = names.path(frame);
-            let report = one_frame(&pack, position, &mut renderer, (&scene, &camera), &document, &path, args.float)?;
+            let report = one_frame(&pack, position, &mut renderer, (&scene, &camera), &document, &path, args)?;
             reports.push(report);
             progress.advance(1);
         }
@@ -92,11 +92,14 @@ fn one_frame(
     (scene, camera): (&Scene, &Camera),
     document: &Value,
     path: &Path,
-    float: bool,
+    args: &RenderArgs,
 ) -> Result<Report, Failure> {
     let number = pack.frames()[position].frame;
     let start = Instant::now();
-    let frame = Frame::read(pack, position)?;
+    let frame = match args.detail {
+        Detail::Full => Frame::read(pack, position),
+        Detail::Gaussians => Frame::read_gaussians(pack, position),
+    }?;
     let decode = start.elapsed().as_secs_f64();
     let failed = |e| Failure::work(format!("{}: frame {number}: {e}", pack.path().display()));
     let start = Instant::now();
@@ -105,7 +108,7 @@ fn one_frame(
     let (film, mut seconds) = renderer.render(camera).map_err(failed)?;
     seconds.source_radiance += prepared;
     let start = Instant::now();
-    let clamped = write(pack, number, &film, scene, document, path, float)?;
+    let clamped = write(pack, number, &film, scene, document, path, args.float)?;
     Ok(Report { frame: number, path: path.to_owned(), decode, seconds, write: start.elapsed().as_secs_f64(), clamped })
 }
 
@@ -227,6 +230,7 @@ fn document(args: &RenderArgs, settings: &RenderSettings, scene: &Scene) -> Valu
         "cutoff": args.cutoff,
         "samples": args.samples,
         "half_resolution": args.half_resolution,
+        "detail": if args.detail == Detail::Full { "full" } else { "gaussians" },
     });
     match settings.route {
         Route::Grid(grid) => {

@@ -9,7 +9,7 @@ mod render;
 
 pub use bake::{AtRest, BakeArgs, GaussianCount, ResidualAddress, TeleportRule};
 pub use compare::CompareArgs;
-pub use render::{ExponentialChoice, MultipleChoice, RenderArgs, RouteChoice, ScatteringOrder};
+pub use render::{Detail, ExponentialChoice, MultipleChoice, RenderArgs, RouteChoice, ScatteringOrder};
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use smoke_formats::sequence::FrameSelection;

@@ -50,6 +50,16 @@ pub enum MultipleChoice {
     Diffusion,
 }
 
+/// How much of a frame is decoded.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum Detail {
+    /// Gaussians and residual: the density within the bake's promise.
+    #[default]
+    Full,
+    /// Gaussians alone: what the fit found, without reading the residual.
+    Gaussians,
+}
+
 /// Options of `render`.
 #[derive(Args, Debug)]
 pub struct RenderArgs {
@@ -64,6 +74,9 @@ pub struct RenderArgs {
     /// Frames to render [default: all in the pack].
     #[arg(long, value_name = "RANGE")]
     pub frames: Option<FrameSelection>,
+    /// How much of a frame is decoded.
+    #[arg(long, value_enum, default_value_t)]
+    pub detail: Detail,
     /// Where the source radiance is solved.
     #[arg(long, value_enum, default_value_t)]
     pub route: RouteChoice,
