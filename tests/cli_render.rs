@@ -134,6 +134,7 @@ fn options_that_do_not_apply_are_wrong_usage_and_not_ignored() {
         (&["--route", "centres", "--multiple", "transport"], "--multiple"),
         (&["--order", "single", "--multiple", "transport"], "--multiple"),
         (&["--order", "single", "--scatter-step", "2"], "--scatter-step"),
+        (&["--method", "reference", "--half-resolution"], "--half-resolution"),
         (&["--march-step", "5"], "--march-step"),
         (&["--cutoff", "1"], "--cutoff"),
         (&["--samples", "0"], "--samples"),

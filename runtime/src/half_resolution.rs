@@ -130,7 +130,7 @@ mod tests {
     fn boxed(density: f32) -> ShadedVolume {
         let nodes: Vec<[f32; 4]> = (0..16 * 16 * 16)
             .map(|v| [v % 16, v / 16 % 16, v / 256])
-            .map(|[i, j, k]| [i >= 3 && i < 15, (1..15).contains(&j), (1..15).contains(&k)])
+            .map(|[i, j, k]| [(3..15).contains(&i), (1..15).contains(&j), (1..15).contains(&k)])
             .map(|inside| [1.0, 1.0, 1.0, if inside == [true; 3] { density } else { 0.0 }])
             .collect();
         ShadedVolume::new([16; 3], &nodes, DAffine3::IDENTITY)
