@@ -9,7 +9,7 @@ mod render;
 
 pub use bake::{AtRest, BakeArgs, GaussianCount, ResidualAddress, TeleportRule};
 pub use compare::{CompareArgs, Picture};
-pub use render::{ExponentialChoice, MethodChoice, MultipleChoice, RenderArgs, RouteChoice, ScatteringOrders};
+pub use render::{Detail, ExponentialChoice, MethodChoice, MultipleChoice, RenderArgs, RouteChoice, ScatteringOrders};
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use smoke_formats::sequence::FrameSelection;
