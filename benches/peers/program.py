@@ -82,3 +82,10 @@ def channels(path, names=("R", "G", "B")):
 
 def standard_error(path):
     return channels(path, [f"standard_error.{c}" for c in "RGB"])
+
+
+def relative_error(image, truth, error, seen):
+    """Relative RMSE over the pixels `seen`, the noise of the truth taken out: its variance adds to the squares of both."""
+    variance = (error[seen] ** 2).mean()
+    squares = ((image[seen] - truth[seen]) ** 2).mean() - variance
+    return float(np.sqrt(max(squares, 0.0) / ((truth[seen] ** 2).mean() - variance)))
