@@ -20,6 +20,7 @@ import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
 
 import mitsuba_scene as ms
+import z_test
 from program import Program, finish, options
 from trade_held import held
 from trade_speed import fast, tracer
@@ -43,7 +44,10 @@ def agreement(program, chosen):
         share = max(result["channels"], key=lambda row: row["beyond"] - row["bound"])
         lines.append(f"| {result['frame']} | {result['variant']} | {mean['z_of_mean']:+.2f} | {100 * mean['difference_of_means']:+.3f} % | {100 * share['beyond']:.2f} % | "
                      f"{100 * share['expected']:.2f} % | {100 * share['bound']:.2f} % | {'yes' if result['good'] else '**no**'} |")
-    return lines, [f"z-test, {r['frame']} {r['variant']}" for r in document["results"] if not r["good"]]
+    pooled = {variant: max(z, key=abs) for variant, z in document["pooled_z"].items()}
+    lines += ["", "All frames of a scene together, largest z of the mean: " + ", ".join(f"{variant} {z:+.2f}" for variant, z in pooled.items()) + "."]
+    missed = [f"z-test, {r['frame']} {r['variant']}" for r in document["results"] if not r["good"]]
+    return lines, missed + [f"z-test, {variant}, all frames together" for variant, z in pooled.items() if not abs(z) <= z_test.Z_OF_MEAN]
 
 
 SECTIONS = {"agreement": agreement, "tracer": tracer, "fast": fast, "sweep": sweep, "held": held}
