@@ -3,7 +3,7 @@
 
     cargo build --release
     python3 -m venv venv && venv/bin/pip install mitsuba numpy scipy
-    venv/bin/python benches/peers/reference.py --work /tmp/peers
+    venv/bin/python benches/peers/reference.py --work WORK
 
 Three frames of the plume under each of: the scene as it is, g = 0.85, an RGB albedo, a sun instead of the sky, single
 scattering. Both take the density from the same pack: ours reads it, Mitsuba gets what `unpack` wrote. The scene means

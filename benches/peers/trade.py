@@ -3,7 +3,7 @@
 
     cargo build --release
     python3 -m venv venv && venv/bin/pip install mitsuba numpy scipy
-    venv/bin/python benches/peers/trade.py --work /tmp/trade
+    venv/bin/python benches/peers/trade.py --work WORK
 
 One command for the page; the machine must be quiet. Each section's result stays in --work and is used again, so that a
 section can be made alone (`--only fast`) and an interrupted run goes on. Needs what `reference.py` needs. Ends with
