@@ -82,6 +82,7 @@ pub fn settings(args: &RenderArgs, base: &RenderSettings) -> Result<RenderSettin
         step: args.march_step.map_or(base.march.step, |v| v as f32),
         cutoff: args.cutoff.map_or(base.march.cutoff, |v| v as f32),
         samples: args.samples.map_or(base.march.samples, usize::from),
+        half_resolution: args.half_resolution || base.march.half_resolution,
     };
     Ok(RenderSettings { route, sh_order, scattering, march })
 }
@@ -96,6 +97,7 @@ pub fn document(settings: &RenderSettings) -> Value {
         "march_step": if settings.march.step == 0.0 { json!("automatic") } else { json!(settings.march.step) },
         "cutoff": settings.march.cutoff,
         "samples": settings.march.samples,
+        "half_resolution": settings.march.half_resolution,
     });
     match settings.route {
         Route::Grid(grid) => {

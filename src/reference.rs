@@ -22,6 +22,7 @@ pub fn settings(args: &RenderArgs, base: &ReferenceSettings) -> Result<Reference
         (args.sh_order.is_some(), "--sh-order"),
         (args.cutoff.is_some(), "--cutoff"),
         (args.samples.is_some(), "--samples"),
+        (args.half_resolution, "--half-resolution"),
     ];
     for (given, option) in numbers {
         does_not_apply(given, option, with)?;

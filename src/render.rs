@@ -3,7 +3,7 @@
 //! Every frame is made from the pack, the scene and the settings alone, never from another frame: one frame or all, one
 //! thread or many, the bytes are the same. All settings go into each image's `smokebake:settings`.
 
-use crate::cli::RenderArgs;
+use crate::cli::{Detail, RenderArgs};
 use crate::method::{Image, Maker, Method};
 use crate::progress::Progress;
 use crate::staging::{SceneChanges, Stage};
@@ -33,6 +33,7 @@ struct Job<'a> {
     scene: &'a Scene,
     /// Dials and scene, for the metadata.
     document: Value,
+    detail: Detail,
     precision: SamplePrecision,
 }
 
@@ -59,7 +60,8 @@ pub fn run(args: &RenderArgs) -> Result<(), Failure> {
     let job = Job {
         pack: &pack,
         scene,
-        document: document(&method, scene),
+        document: document(&method, args.detail, scene),
+        detail: args.detail,
         precision: if args.float { SamplePrecision::Float } else { SamplePrecision::Half },
     };
     let progress = Progress::start(args.progress, "rendering frames", frames.len() as u64 * STEPS);
@@ -94,15 +96,20 @@ pub fn run(args: &RenderArgs) -> Result<(), Failure> {
 }
 
 /// Everything that an image depends on, but for the pack: dials and scene. Image paths as the scene file has them.
-fn document(method: &Method, scene: &Scene) -> Value {
-    json!({ "render": method.document(), "scene": serde_json::to_value(scene).unwrap_or(Value::Null) })
+fn document(method: &Method, detail: Detail, scene: &Scene) -> Value {
+    let mut render = method.document();
+    render["detail"] = json!(if detail == Detail::Full { "full" } else { "gaussians" });
+    json!({ "render": render, "scene": serde_json::to_value(scene).unwrap_or(Value::Null) })
 }
 
 impl Job<'_> {
     fn frame(&self, position: usize, maker: &mut Maker, path: PathBuf, progress: &Progress) -> Result<Report, Failure> {
         let number = self.pack.frames()[position].frame;
         let start = Instant::now();
-        let frame = Frame::read(self.pack, position)?;
+        let frame = match self.detail {
+            Detail::Full => Frame::read(self.pack, position),
+            Detail::Gaussians => Frame::read_gaussians(self.pack, position),
+        }?;
         let mut seconds = vec![("decode", start.elapsed().as_secs_f64())];
         let mut steps = 0;
         let mut advance = |part: f64| {

@@ -3,7 +3,9 @@
 
 pub mod backdrop;
 pub mod camera;
+pub mod error_function;
 pub mod film;
+mod half_resolution;
 pub mod image_difference;
 pub mod lanes;
 pub mod light;
@@ -12,4 +14,5 @@ pub mod medium;
 pub mod plan;
 pub mod renderer;
 pub mod sphere;
+pub mod statistics;
 pub mod transport;

@@ -9,9 +9,9 @@ mod plan;
 mod render;
 
 pub use bake::{AtRest, BakeArgs, GaussianCount, ResidualAddress, TeleportRule};
-pub use compare::CompareArgs;
+pub use compare::{CompareArgs, Picture};
 pub use plan::PlanArgs;
-pub use render::{ExponentialChoice, MethodChoice, MultipleChoice, RenderArgs, RouteChoice, ScatteringOrders};
+pub use render::{Detail, ExponentialChoice, MethodChoice, MultipleChoice, RenderArgs, RouteChoice, ScatteringOrders};
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use smoke_formats::sequence::FrameSelection;
@@ -47,7 +47,7 @@ pub enum Command {
     Validate(ValidateArgs),
     /// Decode a pack's frames to OpenVDB or Mitsuba volumes.
     Unpack(UnpackArgs),
-    /// Measure how far an image is from a reference: RMSE, PSNR, bias, largest error.
+    /// Measure how far an image is from a reference: RMSE, bias, FLIP, and a test against its noise.
     Compare(CompareArgs),
     /// Bake and render a small plume that comes with the program, and relight it.
     Demo(DemoArgs),

@@ -9,9 +9,13 @@
 
 use crate::light::{Light, beams};
 use crate::sphere::harmonics::{BAND, MAX_ORDER, evaluate};
+use crate::transport::compensated::grid::channels::is_single_channel;
+use crate::transport::medium::MediumParameters;
 
 /// Beams that each environment is cut into.
 const CELLS: usize = 1024;
+/// A medium that leaves the question of colour to the light.
+const GREY: MediumParameters = MediumParameters { sigma_t: [1.0; 3], albedo: [1.0; 3], g: 0.0 };
 
 /// The figures of a scene's lights.
 #[derive(Clone, Debug, PartialEq)]
@@ -61,7 +65,7 @@ impl LightSurvey {
             bands: bands.map(|band| share(band, energy)),
             brightest: share(brightest, flux),
             mean_radiance,
-            grey: lights.iter().all(is_grey),
+            grey: is_single_channel(&GREY, lights),
             visible: lights.iter().any(|light| matches!(light, Light::Environment(e) if e.visible)),
         }
     }
@@ -75,15 +79,6 @@ impl LightSurvey {
     /// True if nothing comes from infinity.
     pub fn is_dark(&self) -> bool {
         self.bands == [0.0; MAX_ORDER]
-    }
-}
-
-fn is_grey(light: &Light) -> bool {
-    let same = |rgb: &[f32; 3]| *rgb == [rgb[0]; 3];
-    match light {
-        Light::Environment(environment) => environment.radiance.iter().all(same),
-        Light::Directional { irradiance, .. } => same(irradiance),
-        Light::Point { intensity, .. } => same(intensity),
     }
 }
 

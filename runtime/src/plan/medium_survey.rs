@@ -10,6 +10,7 @@
 use crate::medium::field::DensityField;
 use crate::medium::frame::Frame;
 use crate::transport::compensated::centres::source::UnitPlacement;
+use crate::transport::compensated::grid::channels::is_single_channel;
 use crate::transport::compensated::grid::route::{multiple_step, single_step};
 use crate::transport::medium::MediumParameters;
 
@@ -101,8 +102,7 @@ impl MediumSurvey {
 
     /// True if extinction and albedo are the same in all three channels.
     pub fn is_grey(&self) -> bool {
-        let MediumParameters { sigma_t, albedo, .. } = self.parameters;
-        sigma_t == [sigma_t[0]; 3] && albedo == [albedo[0]; 3]
+        is_single_channel(&self.parameters, &[])
     }
 }
 

@@ -14,6 +14,7 @@
 //! Cost: about 16 paths a pixel and pass where there is smoke. Same bytes on any number of threads: a pixel's numbers
 //! depend on the seed, its place and the pass alone.
 
+mod guide;
 mod lights;
 mod majorant;
 pub mod path;
@@ -65,6 +66,14 @@ pub enum ReferenceError {
     /// A medium parameter out of range.
     #[error(transparent)]
     Medium(#[from] MediumError),
+    /// A pixel's radiance, which overflows for lights near the largest f32.
+    #[error("pixel ({x}, {y}): found radiance that is not finite, expected lights below 1e18")]
+    NotFinite {
+        /// Column.
+        x: usize,
+        /// Row.
+        y: usize,
+    },
     /// A setting out of range.
     #[error("{name}: found {found}, expected {expected}")]
     Setting {
@@ -127,6 +136,7 @@ pub fn trace(
     }
     let extinction = Extinction::new(medium.sigma_t);
     let space = Space::new(field, extinction.max);
+    let lights = (Lights::new(lights, field, &space, extinction.max), Sky::new(lights, None));
     let scene = Scene {
         eye: space.node(camera.position),
         space,
@@ -134,8 +144,8 @@ pub fn trace(
         extinction,
         albedo: Vec3::from_array(medium.albedo),
         g: medium.g,
-        lights: Lights::new(lights),
-        backdrop: Sky::new(lights, None),
+        lights: lights.0,
+        backdrop: lights.1,
         camera: *camera,
         orders: settings.orders.unwrap_or(LONGEST),
         seed: settings.seed,
@@ -150,6 +160,9 @@ pub fn trace(
             }
         });
         passes += 1;
+        if let Some(pixel) = sums.iter().position(|s| !s.radiance.iter().chain(&s.squares).all(|v| v.is_finite())) {
+            return Err(ReferenceError::NotFinite { x: pixel % camera.width, y: pixel / camera.width });
+        }
         let relative_error = relative_error(&sums, passes);
         on_pass(passes, relative_error);
         let enough = passes >= LEAST_PASSES && relative_error <= settings.target_error;
