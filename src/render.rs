@@ -148,13 +148,13 @@ fn fraction(fps: f64) -> Option<(i32, u32)> {
 }
 
 /// What the command line changes in the scene.
-fn changes(args: &RenderArgs) -> SceneChanges {
+pub(crate) fn changes(args: &RenderArgs) -> SceneChanges {
     let RenderArgs { sigma_t, albedo, g, width, height, .. } = *args;
     SceneChanges { sigma_t, albedo, g, width, height }
 }
 
 /// The dials, after a check that each given one applies.
-fn settings(args: &RenderArgs) -> Result<RenderSettings, Failure> {
+pub(crate) fn settings(args: &RenderArgs) -> Result<RenderSettings, Failure> {
     let single = args.order == Order::Single;
     let refuse = |given: bool, option: &str, with: &str| match given {
         true => Err(clap::Error::raw(
@@ -217,7 +217,7 @@ fn settings(args: &RenderArgs) -> Result<RenderSettings, Failure> {
 }
 
 /// Everything that an image depends on, but for the pack: dials and scene. Image paths as the scene file has them.
-fn document(args: &RenderArgs, settings: &RenderSettings, scene: &Scene) -> Value {
+pub(crate) fn document(args: &RenderArgs, settings: &RenderSettings, scene: &Scene) -> Value {
     let automatic = |step: usize| if step == 0 { json!("automatic") } else { json!(step) };
     let mut render = json!({
         "order": if args.order == Order::Single { "single" } else { "all" },

@@ -9,6 +9,7 @@ pub mod lanes;
 pub mod light;
 pub mod march;
 pub mod medium;
+pub mod noisy_reference;
 pub mod renderer;
 pub mod sphere;
 pub mod transport;

@@ -1,0 +1,145 @@
+//! One reference, and one point against it.
+
+use super::store::ReferenceImage;
+use super::table::{Progressed, ReferenceFigures, Seconds};
+use crate::contact_sheet;
+use crate::failure::Failure;
+use crate::staging::Stage;
+use smoke_formats::image::RgbImage;
+use smoke_formats::pack::Pack;
+use smoke_runtime::film::Film;
+use smoke_runtime::image_difference::{self, Pair};
+use smoke_runtime::medium::field::DensityField;
+use smoke_runtime::medium::frame::Frame;
+use smoke_runtime::noisy_reference::{Distance, distance};
+use smoke_runtime::renderer::{RenderSettings, Renderer};
+use std::time::Instant;
+use super::stand_in as reference;
+
+/// Error at which the false colours of a difference are full, relative to the root mean square of the reference.
+pub const FULL_COLOUR: f64 = 0.1;
+/// Widest thumbnail, in pixels.
+const WIDEST: usize = 160;
+
+/// Traces the reference of `field` on `stage`: scattering orders up to `orders` until its relative standard error is
+/// `target`. `on_pass` is told what has been reached.
+pub fn reference(
+    field: &DensityField,
+    stage: &Stage,
+    orders: Option<u32>,
+    target: f64,
+    on_pass: &mut dyn FnMut(u32, f64),
+) -> Result<(ReferenceImage, ReferenceFigures), Failure> {
+    let settings = reference::ReferenceSettings { orders, target_error: target, ..Default::default() };
+    let start = Instant::now();
+    let mut curve = Vec::new();
+    let mut last = None;
+    let mut watch = |passes: u32, error: f64| {
+        // Infinite after the first pass, which knows no spread.
+        if error.is_finite() {
+            let now = Progressed { passes, seconds: start.elapsed().as_secs_f64(), relative_standard_error: error };
+            if passes.is_power_of_two() {
+                curve.push(now);
+            }
+            last = Some(now);
+        }
+        on_pass(passes, error);
+    };
+    let traced = reference::trace(field, &stage.medium, &stage.lights, &stage.camera, &settings, &mut watch);
+    let estimate = traced.map_err(|e| Failure::work(format!("reference: {e}")))?;
+    let seconds = start.elapsed().as_secs_f64();
+    if let Some(last) = last.filter(|last| curve.last() != Some(last)) {
+        curve.push(last);
+    }
+    let image = ReferenceImage {
+        width: estimate.film.width,
+        radiance: estimate.film.pixels.iter().map(|p| p.radiance).collect(),
+        standard_error: estimate.standard_error,
+        alpha: estimate.film.pixels.iter().map(|p| p.alpha()).collect(),
+    };
+    // The tracer counts all pixels; a sweep those with smoke. The variance of both falls with the passes alike.
+    let own = image.radiance.clone();
+    let seen = image.distance(&own, &image.alpha).map_or(estimate.relative_error, |d| d.noise);
+    let scale = if estimate.relative_error > 0.0 { seen / estimate.relative_error } else { 1.0 };
+    curve.iter_mut().for_each(|at| at.relative_standard_error *= scale);
+    Ok((image, ReferenceFigures { passes: estimate.passes, seconds, relative_standard_error: seen, curve }))
+}
+
+/// Renders one frame of `pack` `repeat` times from the file to the film, on the current pool of threads; gives the film
+/// and the seconds of the median. An inner error is a point that the method refuses.
+pub fn render(
+    pack: &Pack,
+    position: usize,
+    settings: RenderSettings,
+    stage: &Stage,
+    repeat: u8,
+) -> Result<Result<(Film, Seconds), String>, Failure> {
+    let mut runs: Vec<(Seconds, Film)> = Vec::new();
+    for _ in 0..repeat.max(1) {
+        let mut renderer = match Renderer::new(settings, stage.medium, stage.lights.clone()) {
+            Ok(renderer) => renderer,
+            Err(e) => return Ok(Err(e.to_string())),
+        };
+        let start = Instant::now();
+        let frame = Frame::read(pack, position)?;
+        let decode = start.elapsed().as_secs_f64();
+        let start = Instant::now();
+        let set = renderer.set_frame(frame);
+        let prepared = start.elapsed().as_secs_f64();
+        let (film, seconds) = match set.and_then(|()| renderer.render(&stage.camera)) {
+            Ok(rendered) => rendered,
+            Err(e) => return Ok(Err(e.to_string())),
+        };
+        let source_radiance = prepared + seconds.source_radiance;
+        let total = decode + source_radiance + seconds.volume_pass + seconds.view_pass;
+        let (volume_pass, view_pass) = (seconds.volume_pass, seconds.view_pass);
+        runs.push((Seconds { decode, source_radiance, volume_pass, view_pass, total }, film));
+    }
+    runs.sort_by(|a, b| a.0.total.total_cmp(&b.0.total));
+    let (seconds, film) = runs.swap_remove(runs.len() / 2);
+    Ok(Ok((film, seconds)))
+}
+
+impl ReferenceImage {
+    /// How far `radiance` with opacities `alpha` is from this reference, over the pixels where either sees smoke.
+    pub fn distance(&self, radiance: &[[f32; 3]], alpha: &[f32]) -> Result<Distance, image_difference::Incomparable> {
+        let mask = image_difference::seen(alpha, Some(&self.alpha));
+        let pair = Pair { width: self.width, test: radiance, reference: &self.radiance, mask: Some(&mask) };
+        distance(&pair, &self.standard_error)
+    }
+
+    /// The reference as a thumbnail.
+    pub fn thumbnail(&self) -> RgbImage {
+        self.exposed(&self.radiance)
+    }
+
+    /// `radiance` as a thumbnail, as bright as the reference's.
+    pub fn exposed(&self, radiance: &[[f32; 3]]) -> RgbImage {
+        let image = |pixels: &[[f32; 3]]| RgbImage {
+            width: self.width,
+            height: pixels.len() / self.width,
+            pixels: pixels.to_vec(),
+        };
+        let exposure = contact_sheet::exposure(&[image(&self.radiance)]);
+        contact_sheet::thumbnail(&image(radiance), self.thumbnail_size(), exposure)
+    }
+
+    /// The signed difference of `radiance` from the reference in false colour, full at [`FULL_COLOUR`].
+    pub fn false_colour(&self, radiance: &[[f32; 3]], alpha: &[f32]) -> Result<RgbImage, Failure> {
+        let mask = image_difference::seen(alpha, Some(&self.alpha));
+        let samples = self.radiance.iter().zip(&mask).filter(|(_, seen)| **seen).flat_map(|(p, _)| p);
+        let (sum, count) = samples.fold((0.0, 0.0), |(sum, count), &v| (sum + f64::from(v) * f64::from(v), count + 1.0));
+        let scale = FULL_COLOUR * (sum / f64::max(count, 1.0)).sqrt();
+        let pair = Pair { width: self.width, test: radiance, reference: &self.radiance, mask: Some(&mask) };
+        let pixels = image_difference::false_colour(&pair, if scale > 0.0 { scale } else { 1.0 });
+        let pixels = pixels.map_err(|e| Failure::work(e.to_string()))?;
+        let image = RgbImage { width: self.width, height: pixels.len() / self.width, pixels };
+        Ok(contact_sheet::thumbnail(&image, self.thumbnail_size(), 1.0))
+    }
+
+    fn thumbnail_size(&self) -> [usize; 2] {
+        let height = self.radiance.len() / self.width;
+        let width = self.width.min(WIDEST);
+        [width, (width * height).div_ceil(self.width).max(1)]
+    }
+}

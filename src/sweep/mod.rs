@@ -1,0 +1,383 @@
+//! `smoke-bake sweep INPUT --scene SCENE -o DIR`: what every dial costs and buys, against an unbiased reference.
+//!
+//! | file | what |
+//! |---|---|
+//! | `options` | options of `render` and `bake` by name, parsed as the command line parses them |
+//! | `points` | which settings are measured |
+//! | `source` | the true density, and the packs |
+//! | `measure` | a reference; a point against it |
+//! | `store` | the folder, and what a later run finds in it |
+//! | `table` | rows as CSV and JSON |
+//! | `plot`, `page`, `style.css` | the page of plots |
+//!
+//! For each scene, combination of axes and frame: one reference, then every point. Bakes come first.
+
+mod measure;
+mod options;
+mod page;
+mod plot;
+mod points;
+mod source;
+mod stand_in;
+mod store;
+mod table;
+
+use crate::cli::{RenderArgs, ScatteringOrder, SweepArgs};
+use crate::progress::Progress;
+use crate::staging::Stage;
+use crate::{answer, failure::Failure, render};
+use measure::FULL_COLOUR;
+use options::{AXES, Options, Owner};
+use points::Point;
+use rayon::ThreadPool;
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+use smoke_baking::survey::hash_file;
+use smoke_formats::pack::Pack;
+use smoke_formats::scene::{Light, Scene, Sky};
+use smoke_formats::{atomic, image};
+use source::Source;
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use store::{Key, ReferenceImage, Store};
+use table::{Figures, Group, Place, ReferenceFigures, Row};
+
+/// Steps of progress of one bake, and of one reference; a point is one step.
+const LONG: u64 = 10;
+/// Pixels of an image whose size is not given.
+const PIXELS: f64 = 20_000.0;
+
+/// What came of a point, as the journal has it.
+#[derive(Serialize, Deserialize)]
+enum Outcome {
+    /// Figures.
+    Measured(Box<Figures>),
+    /// The method does not take this frame, scene or setting.
+    Refused(String),
+}
+
+/// One scene file with one value for each axis.
+struct Setting {
+    scene: PathBuf,
+    axes: Vec<(String, String)>,
+    stage: Stage,
+    orders: Option<u32>,
+}
+
+/// Checks everything that was asked, measures it, and writes the three answers.
+pub fn run(args: &SweepArgs) -> Result<(), Failure> {
+    let base = base(args)?;
+    let settings = settings(args)?;
+    let source = Source::open(args, &base)?;
+    let dials = if args.dial.is_empty() { points::usual(source.density_max()) } else { args.dial.clone() };
+    let points = points::expand(&base, &dials, args.grid)?;
+    let store = Store::open(&args.output, args.resume)?;
+    let mut sweep = Sweep { args, source, points, store, pools: Pools::default() };
+    let groups = sweep.measure(&settings)?;
+    let names: Vec<Value> = dials.iter().map(|d| json!({ "name": d.name, "values": d.values })).collect();
+    let asked = json!({
+        "input": args.input, "scenes": args.scene, "frames": sweep.source.frames(), "dials": names, "grid": args.grid,
+        "set": base.iter().map(|(name, value)| json!({ "name": name, "value": value })).collect::<Vec<_>>(),
+        "vary": args.vary.iter().map(|d| json!({ "name": d.name, "values": d.values })).collect::<Vec<_>>(),
+        "reference_error": args.reference_error, "repeat": args.repeat,
+        "cores": std::thread::available_parallelism().map_or(1, usize::from),
+    });
+    sweep.answer(&groups, asked)
+}
+
+/// The options that hold throughout: `--set` and the sweep's threads.
+fn base(args: &SweepArgs) -> Result<Options, Failure> {
+    let pack = source::is_pack(&args.input).then_some(args.input.as_path());
+    points::check_names("--dial", &args.dial, pack)?;
+    points::check_names("--set", &args.set, pack)?;
+    let mut base = Options::default();
+    if let Some(threads) = args.threads {
+        base = base.with("threads", &threads.to_string());
+    }
+    for set in &args.set {
+        let [value] = set.values.as_slice() else {
+            let text = format!("--set {}: expected one value; give several to --dial\n", set.name);
+            return Err(clap::Error::raw(clap::error::ErrorKind::TooManyValues, text).into());
+        };
+        base = base.with(&set.name, value);
+    }
+    Ok(base)
+}
+
+/// Every scene with every combination of the axes' values, read and checked.
+fn settings(args: &SweepArgs) -> Result<Vec<Setting>, Failure> {
+    for (i, axis) in args.vary.iter().enumerate() {
+        if !AXES.contains(&axis.name.as_str()) || args.vary[..i].iter().any(|other| other.name == axis.name) {
+            return Err(options::unknown("--vary", &axis.name, &AXES));
+        }
+    }
+    let mut combinations = vec![Vec::new()];
+    for axis in &args.vary {
+        let longer = |before: &Vec<(String, String)>| -> Vec<Vec<(String, String)>> {
+            let with = |value: &String| before.iter().cloned().chain([(axis.name.clone(), value.clone())]).collect();
+            axis.values.iter().map(with).collect()
+        };
+        combinations = combinations.iter().flat_map(longer).collect();
+    }
+    let mut all = Vec::new();
+    for scene in &args.scene {
+        let size = size(&Scene::read(scene)?, args.width, args.height);
+        for axes in &combinations {
+            let mut options = Options::default();
+            for (name, value) in axes {
+                options = options.with(name, value);
+            }
+            let render = options.render()?;
+            let mut changes = render::changes(&render);
+            (changes.width, changes.height) = (Some(size[0]), Some(size[1]));
+            let stage = Stage::read(scene, &changes)?;
+            let orders = (render.order == ScatteringOrder::Single).then_some(1);
+            all.push(Setting { scene: scene.clone(), axes: axes.clone(), stage, orders });
+        }
+    }
+    Ok(all)
+}
+
+/// Width and height: what is given, the other in proportion; else the scene's, but no more than [`PIXELS`] in all.
+fn size(scene: &Scene, width: Option<u32>, height: Option<u32>) -> [u32; 2] {
+    let (w, h) = (f64::from(scene.width), f64::from(scene.height));
+    let scaled = |length: f64, by: f64| (length * by).round().clamp(1.0, 65536.0) as u32;
+    match (width, height) {
+        (Some(width), Some(height)) => [width, height],
+        (Some(width), None) => [width, scaled(h, f64::from(width) / w)],
+        (None, Some(height)) => [scaled(w, f64::from(height) / h), height],
+        (None, None) => [w, h].map(|length| scaled(length, (PIXELS / (w * h)).sqrt().min(1.0))),
+    }
+}
+
+/// Pools of threads by their size; 0 is one thread for each core.
+#[derive(Default)]
+struct Pools(BTreeMap<usize, ThreadPool>);
+
+impl Pools {
+    fn get(&mut self, threads: usize) -> Result<&ThreadPool, Failure> {
+        if !self.0.contains_key(&threads) {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
+            self.0.insert(threads, pool.map_err(|e| Failure::work(format!("--threads: {e}")))?);
+        }
+        self.0.get(&threads).ok_or_else(|| Failure::work("no threads"))
+    }
+}
+
+struct Sweep<'a> {
+    args: &'a SweepArgs,
+    source: Source,
+    points: Vec<Point>,
+    store: Store,
+    pools: Pools,
+}
+
+impl Sweep<'_> {
+    /// Bakes, then every group.
+    fn measure(&mut self, settings: &[Setting]) -> Result<Vec<Group>, Failure> {
+        let mut bakes: Vec<Options> = self.points.iter().map(|p| p.options.of(Owner::Bake)).collect();
+        bakes.sort();
+        bakes.dedup();
+        let groups = (settings.len() * self.source.frames().len()) as u64;
+        let steps = LONG * bakes.len() as u64 + groups * (LONG + self.points.len() as u64);
+        let progress = Progress::start(self.args.progress, "sweeping", steps);
+        let mut packs = BTreeMap::new();
+        for bake in bakes {
+            progress.describe(format!("baking {}", words(&bake)));
+            let threads = self.args.threads.unwrap_or(0);
+            let (source, store) = (&self.source, &self.store);
+            let pack = self.pools.get(threads)?.install(|| source.pack(&bake, store))?;
+            packs.insert(bake, pack);
+            progress.advance(LONG);
+        }
+        let mut all = Vec::new();
+        for setting in settings {
+            for i in 0..self.source.frames().len() {
+                all.push(self.group(setting, i, &packs, &progress)?);
+            }
+        }
+        progress.finish();
+        Ok(all)
+    }
+
+    /// The reference of swept frame `i` under `setting`, and every point against it.
+    fn group(
+        &mut self,
+        setting: &Setting,
+        i: usize,
+        packs: &BTreeMap<Options, Pack>,
+        progress: &Progress,
+    ) -> Result<Group, Failure> {
+        let place = Place {
+            scene: setting.scene.display().to_string(),
+            axes: setting.axes.clone(),
+            frame: self.source.frames()[i],
+        };
+        let (key, image, reference) = self.reference(setting, i, progress)?;
+        progress.advance(LONG);
+        let (mut rows, mut refused) = (Vec::new(), Vec::new());
+        for index in 0..self.points.len() {
+            let point = self.points[index].clone();
+            let turned = if point.value.is_empty() { point.dial.clone() } else { format!("{} {}", point.dial, point.value) };
+            progress.describe(format!("frame {}, {turned}", place.frame));
+            let bake = point.options.of(Owner::Bake);
+            let Some(pack) = packs.get(&bake) else { continue };
+            let (picture, outcome) = self.point(setting, i, pack, &point, (&key, &image))?;
+            match outcome {
+                Outcome::Measured(figures) => rows.push(Row {
+                    place: place.clone(),
+                    dial: point.dial,
+                    value: point.value,
+                    bake: words(&bake),
+                    figures: *figures,
+                    picture,
+                }),
+                Outcome::Refused(why) => {
+                    eprintln!("smoke-bake: note: frame {}, {turned}: left out: {why}", place.frame);
+                    refused.push([point.dial, point.value, why]);
+                }
+            }
+            progress.advance(1);
+        }
+        let size = [image.width, image.radiance.len() / image.width];
+        Ok(Group { place, size, reference, picture: key, full_colour: FULL_COLOUR, rows, refused })
+    }
+
+    fn reference(
+        &mut self,
+        setting: &Setting,
+        i: usize,
+        progress: &Progress,
+    ) -> Result<(Key, ReferenceImage, ReferenceFigures), Failure> {
+        let target = self.args.reference_error;
+        let scene = serde_json::to_string(&setting.stage.scene).map_err(|e| Failure::work(e.to_string()))?;
+        let images = image_hashes(&setting.stage.scene)?;
+        let asked = format!("{:?} {target}", setting.orders);
+        let key = Key::of(&["reference", &self.source.identity(i), &scene, &images, &asked]);
+        if let Some(figures) = self.store.find(&key) {
+            return Ok((key.clone(), self.store.read_reference(&key)?, figures));
+        }
+        let frame = self.source.frames()[i];
+        let field = self.source.truth(i)?;
+        let mut on_pass = |passes: u32, error: f64| {
+            progress.describe(format!("frame {frame}, reference, pass {passes}, {:.2} %", 100.0 * error));
+        };
+        let pool = self.pools.get(self.args.threads.unwrap_or(0))?;
+        let traced = pool.install(|| measure::reference(&field, &setting.stage, setting.orders, target, &mut on_pass));
+        let (image, figures) = traced?;
+        self.store.write_reference(&key, &image)?;
+        image::write_png(&self.store.picture(&key), &image.thumbnail())?;
+        self.store.keep(&key, &figures)?;
+        Ok((key, image, figures))
+    }
+
+    fn point(
+        &mut self,
+        setting: &Setting,
+        i: usize,
+        pack: &Pack,
+        point: &Point,
+        (reference, truth): (&Key, &ReferenceImage),
+    ) -> Result<(Key, Outcome), Failure> {
+        let render: RenderArgs = point.options.render()?;
+        // The Debug form has every option: whatever is not the same in it is another point.
+        let (made_by, repeat) = (format!("{render:?}"), self.args.repeat.to_string());
+        let key = Key::of(&["point", reference.as_str(), &format!("{:016x}", pack.checksum()), &made_by, &repeat]);
+        if let Some(outcome) = self.store.find(&key) {
+            return Ok((key, outcome));
+        }
+        let (settings, repeat) = (render::settings(&render)?, self.args.repeat);
+        let position = self.source.position(i);
+        let pool = self.pools.get(render.threads.unwrap_or(0))?;
+        let rendered = pool.install(|| measure::render(pack, position, settings, &setting.stage, repeat))?;
+        let threads = pool.current_num_threads();
+        let outcome = match rendered {
+            Err(why) => Outcome::Refused(why),
+            Ok((film, seconds)) => {
+                let radiance: Vec<[f32; 3]> = film.pixels.iter().map(|p| p.radiance).collect();
+                let alpha: Vec<f32> = film.pixels.iter().map(|p| p.alpha()).collect();
+                match truth.distance(&radiance, &alpha) {
+                    Err(e) => Outcome::Refused(e.to_string()),
+                    Ok(d) if !(d.relative_rmse.is_finite() && d.bias.is_finite() && d.bias_error.is_finite()) => {
+                        Outcome::Refused("the reference is black, and the image is not".into())
+                    }
+                    Ok(d) => {
+                        image::write_png(&self.store.picture(&key), &truth.exposed(&radiance))?;
+                        image::write_png(&self.store.difference(&key), &truth.false_colour(&radiance, &alpha)?)?;
+                        let mut document = render::document(&render, &settings, &setting.stage.scene)["render"].take();
+                        document["threads"] = json!(threads);
+                        let at_rest: u64 = pack.frames().iter().map(|f| f.bytes_at_rest).sum();
+                        let active: u64 = pack.frames().iter().map(|f| f.active_voxels).sum();
+                        Outcome::Measured(Box::new(Figures {
+                            relative_rmse: d.relative_rmse,
+                            relative_rmse_standard_error: d.relative_rmse_error,
+                            bias: d.bias,
+                            bias_standard_error: d.bias_error,
+                            seconds,
+                            pack_bytes: pack.file_bytes(),
+                            bits_per_active_voxel: 8.0 * at_rest as f64 / active.max(1) as f64,
+                            method: document["route"].as_str().unwrap_or_default().to_owned(),
+                            settings: document,
+                        }))
+                    }
+                }
+            }
+        };
+        self.store.keep(&key, &outcome)?;
+        Ok((key, outcome))
+    }
+
+    /// Writes CSV, JSON and page, and says where they are.
+    fn answer(&self, groups: &[Group], asked: Value) -> Result<(), Failure> {
+        let write = |name: &str, text: &str| atomic::write_bytes(&self.store.path(name), text.as_bytes());
+        let document = table::json(groups, asked);
+        let text = serde_json::to_string_pretty(&document).map_err(|e| Failure::work(format!("sweep.json: {e}")))?;
+        write("sweep.csv", &table::csv(groups))?;
+        write("sweep.json", &(text + "\n"))?;
+        write("index.html", &page::html(groups, &self.args.input, &self.store)?)?;
+        if self.args.json {
+            return answer::json(&document);
+        }
+        let rows: usize = groups.iter().map(|g| g.rows.len()).sum();
+        let page = self.store.path("index.html");
+        answer::text(&format!("{}: {rows} rows against {} references\n", page.display(), groups.len()))
+    }
+}
+
+/// Options as text: `gaussians=100 max-error=0.01`.
+fn words(options: &Options) -> String {
+    options.iter().map(|(name, value)| format!("{name}={value}")).collect::<Vec<_>>().join(" ")
+}
+
+/// The contents of the images that a scene names.
+fn image_hashes(scene: &Scene) -> Result<String, Failure> {
+    let mut text = String::new();
+    for light in &scene.lights {
+        if let Light::Environment { sky: Sky::Image { resolved, .. }, .. } = light {
+            text += &format!("{:032x} ", u128::from_le_bytes(hash_file(resolved)?));
+        }
+    }
+    Ok(text)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_image_has_about_twenty_thousand_pixels_in_the_scenes_shape_and_is_never_enlarged() {
+        let path = std::path::Path::new("a.toml");
+        let text = "[camera]\nposition = [0, 0, 0]\ntarget = [1, 0, 0]\nfov = 30\n[image]\nwidth = W\nheight = H\n\
+                    [medium]\nsigma_t = 1\n";
+        let scene = |w: u32, h: u32| {
+            let text = text.replace('W', &w.to_string()).replace('H', &h.to_string());
+            Scene::parse(path, &text).unwrap()
+        };
+        assert_eq!(size(&scene(300, 400), None, None), [122, 163]);
+        assert_eq!(size(&scene(30, 40), None, None), [30, 40]);
+        assert_eq!(size(&scene(65536, 1), None, None), [36204, 1]);
+        assert_eq!(size(&scene(300, 400), Some(60), None), [60, 80]);
+        assert_eq!(size(&scene(300, 400), None, Some(40)), [30, 40]);
+        assert_eq!(size(&scene(300, 400), Some(7), Some(9)), [7, 9]);
+    }
+}
