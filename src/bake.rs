@@ -36,7 +36,7 @@ fn bake(args: &BakeArgs) -> Result<(), Failure> {
 }
 
 /// Bakes as `bake` does, and answers with the pack instead of words. On the current pool of threads.
-pub(crate) fn pack(args: &BakeArgs) -> Result<Pack, Failure> {
+pub fn pack(args: &BakeArgs) -> Result<Pack, Failure> {
     let (survey, settings) = prepare(args)?;
     write(args, &survey, &settings)
 }

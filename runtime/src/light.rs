@@ -42,20 +42,30 @@ impl Environment {
     }
 
     /// Unit direction, world space, of texel coordinates (`u`, `v`) in [0, 1].
-    fn direction(&self, u: f64, v: f64) -> DVec3 {
+    pub fn direction(&self, u: f64, v: f64) -> DVec3 {
         let azimuth = (0.5 - u) * std::f64::consts::TAU + self.rotation;
         let elevation = (0.5 - v) * std::f64::consts::PI;
         let (x, y, z) = (elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin());
         if self.up_is_y { DVec3::new(x, z, -y) } else { DVec3::new(x, y, z) }
     }
 
-    /// Radiance that arrives from direction `d` (a unit vector that points to the sky), bilinear between the middles of
-    /// the texels: round the horizon, and the topmost and lowest rows for the poles.
-    pub fn radiance_from(&self, d: Vec3) -> [f32; 3] {
+    /// Texture coordinates in [0, 1] of a unit direction, world space: the way back of [`Self::direction`].
+    pub fn place(&self, d: Vec3) -> [f64; 2] {
         let (x, y, z) = if self.up_is_y { (d.x, -d.z, d.y) } else { (d.x, d.y, d.z) };
         let u = 0.5 - (f64::from(y).atan2(f64::from(x)) - self.rotation) / std::f64::consts::TAU;
         let v = 0.5 - f64::from(z.clamp(-1.0, 1.0)).asin() / std::f64::consts::PI;
-        let (x, y) = ((u - u.floor()) * self.width as f64 - 0.5, v * self.height as f64 - 0.5);
+        [u - u.floor(), v]
+    }
+
+    /// Radiance that arrives from direction `d` (a unit vector that points to the sky), bilinear between the middles of
+    /// the texels: round the horizon, and the topmost and lowest rows for the poles.
+    pub fn radiance_from(&self, d: Vec3) -> [f32; 3] {
+        self.radiance_at(self.place(d))
+    }
+
+    /// Radiance at texture coordinates in [0, 1].
+    pub fn radiance_at(&self, [u, v]: [f64; 2]) -> [f32; 3] {
+        let (x, y) = (u * self.width as f64 - 0.5, v * self.height as f64 - 0.5);
         let (f, g) = ((x - x.floor()) as f32, (y - y.floor()) as f32);
         // One turn more than none, so that the cast of -1 cannot happen.
         let column = |step: usize| ((x + self.width as f64).floor() as usize + step) % self.width;

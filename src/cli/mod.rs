@@ -10,7 +10,7 @@ mod sweep;
 
 pub use bake::{AtRest, BakeArgs, GaussianCount, ResidualAddress, TeleportRule};
 pub use compare::CompareArgs;
-pub use render::{ExponentialChoice, MultipleChoice, RenderArgs, RouteChoice, ScatteringOrder};
+pub use render::{ExponentialChoice, MethodChoice, MultipleChoice, RenderArgs, RouteChoice, ScatteringOrders};
 pub use sweep::{Assignment, SweepArgs};
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
@@ -129,6 +129,15 @@ pub(super) fn positive(text: &str) -> Result<f64, String> {
         Ok(v) if v.is_finite() && v > 0.0 => Ok(v),
         _ => Err("expected a finite number above zero".into()),
     }
+}
+
+/// A positive ratio, as a number or in per cent.
+pub(super) fn ratio(text: &str) -> Result<f64, String> {
+    let value = match text.strip_suffix('%') {
+        Some(percent) => positive(percent.trim_end()).map(|v| v / 100.0),
+        None => positive(text),
+    };
+    value.map_err(|_| "expected a number above zero, such as 0.02 or 2%".into())
 }
 
 /// One number for R, G and B, or three with commas.

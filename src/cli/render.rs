@@ -1,18 +1,58 @@
 //! Options of `render`.
 
-use super::{ProgressMode, Rgb, cutoff, exr_pattern, march_step, rgb, threads};
+use super::{ProgressMode, Rgb, cutoff, exr_pattern, march_step, ratio, rgb, threads};
 use clap::{Args, ValueEnum};
 use smoke_formats::sequence::FrameSelection;
 use std::path::PathBuf;
 
-/// Which scattering orders are rendered.
+/// How an image is made.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
-pub enum ScatteringOrder {
-    /// Light that was scattered once.
-    Single,
+pub enum MethodChoice {
+    /// What the scene allows.
+    #[default]
+    Auto,
+    /// Source radiance and a march: fast (Zhou et al. 2008, with its errors mended).
+    Compensated,
+    /// Unbiased path tracing: slow, and as exact as it is long.
+    Reference,
+}
+
+/// Which scattering orders are rendered.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum ScatteringOrders {
     /// Light of all orders.
     #[default]
     All,
+    /// Light that was scattered at most so often, at least 1.
+    UpTo(u32),
+}
+
+impl ScatteringOrders {
+    /// Light that was scattered once.
+    pub const SINGLE: Self = Self::UpTo(1);
+}
+
+impl std::fmt::Display for ScatteringOrders {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::All => f.write_str("all"),
+            Self::UpTo(1) => f.write_str("single"),
+            Self::UpTo(n) => n.fmt(f),
+        }
+    }
+}
+
+fn orders(text: &str) -> Result<ScatteringOrders, String> {
+    match text {
+        "all" => Ok(ScatteringOrders::All),
+        "single" => Ok(ScatteringOrders::SINGLE),
+        n => n
+            .parse()
+            .ok()
+            .filter(|n| (1..=16_384).contains(n))
+            .map(ScatteringOrders::UpTo)
+            .ok_or_else(|| "expected single, all or a number from 1 to 16384".into()),
+    }
 }
 
 /// Where the source radiance is solved.
@@ -64,12 +104,24 @@ pub struct RenderArgs {
     /// Frames to render [default: all in the pack].
     #[arg(long, value_name = "RANGE")]
     pub frames: Option<FrameSelection>,
-    /// Where the source radiance is solved.
+    /// How the images are made.
+    #[arg(long, value_enum, default_value_t)]
+    pub method: MethodChoice,
+    /// Scattering orders: single, all, or at most N (method reference).
+    #[arg(long, value_name = "ORDERS", default_value_t, value_parser = orders)]
+    pub order: ScatteringOrders,
+    /// Relative standard error at which an image is finished, such as 1% (method reference) [default: 2%].
+    #[arg(long, value_name = "ERROR", value_parser = ratio)]
+    pub target_error: Option<f64>,
+    /// Most passes of an image, at least 2 (method reference) [default: 1000000].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(2..))]
+    pub max_passes: Option<u32>,
+    /// Seed of the paths (method reference) [default: 1].
+    #[arg(long, value_name = "N")]
+    pub seed: Option<u64>,
+    /// Where the source radiance is solved (method compensated).
     #[arg(long, value_enum, default_value_t)]
     pub route: RouteChoice,
-    /// Scattering orders.
-    #[arg(long, value_enum, default_value_t)]
-    pub order: ScatteringOrder,
     /// Order of the spherical harmonics of phase function and source radiance.
     #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u8).range(1..=6))]
     pub sh_order: u8,

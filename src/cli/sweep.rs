@@ -1,6 +1,6 @@
 //! Options of `sweep`.
 
-use super::{ProgressMode, threads};
+use super::{ProgressMode, ratio, threads};
 use clap::Args;
 use smoke_formats::sequence::FrameSelection;
 use std::path::PathBuf;
@@ -47,7 +47,7 @@ pub struct SweepArgs {
     #[arg(long, value_name = "PIXELS", value_parser = clap::value_parser!(u32).range(1..=65536))]
     pub height: Option<u32>,
     /// Relative standard error at which a reference is good enough.
-    #[arg(long, value_name = "PART", default_value = "0.7%", value_parser = part)]
+    #[arg(long, value_name = "ERROR", default_value = "0.7%", value_parser = ratio)]
     pub reference_error: f64,
     /// Renders of each point; the seconds are those of the median.
     #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u8).range(1..=99))]
@@ -77,15 +77,6 @@ fn assignment(text: &str) -> Result<Assignment, String> {
     }
 }
 
-/// A part of one: `0.5%` or `0.005`, above 0 and at most 1.
-fn part(text: &str) -> Result<f64, String> {
-    let (number, scale) = text.strip_suffix('%').map_or((text, 1.0), |percent| (percent, 0.01));
-    match number.trim().parse::<f64>().map(|v| v * scale) {
-        Ok(v) if v > 0.0 && v <= 1.0 => Ok(v),
-        _ => Err("expected a part such as 0.5% or 0.005, above 0 and at most 100%".into()),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::super::tests::parse;
@@ -101,14 +92,6 @@ mod tests {
         assert_eq!(args.reference_error, 0.007);
         for bad in ["sh-order", "=1", "sh-order=", "sh-order=1,,2"] {
             assert!(parse::<SweepArgs>(&[&line[..], &["--dial", bad]].concat()).is_err(), "{bad}");
-        }
-    }
-
-    #[test]
-    fn a_part_is_a_percentage_or_a_fraction() {
-        assert_eq!((part("0.5%"), part("0.005"), part("100 %")), (Ok(0.005), Ok(0.005), Ok(1.0)));
-        for bad in ["0", "-1%", "101%", "nan", "inf", "", "%"] {
-            assert!(part(bad).is_err(), "{bad}");
         }
     }
 }

@@ -18,11 +18,11 @@ mod page;
 mod plot;
 mod points;
 mod source;
-mod stand_in;
 mod store;
 mod table;
 
-use crate::cli::{RenderArgs, ScatteringOrder, SweepArgs};
+use crate::cli::{RenderArgs, ScatteringOrders, SweepArgs};
+use crate::method::Method;
 use crate::progress::Progress;
 use crate::staging::Stage;
 use crate::{answer, failure::Failure, render};
@@ -70,7 +70,8 @@ pub fn run(args: &SweepArgs) -> Result<(), Failure> {
     let settings = settings(args)?;
     let source = Source::open(args, &base)?;
     let dials = if args.dial.is_empty() { points::usual(source.density_max()) } else { args.dial.clone() };
-    let points = points::expand(&base, &dials, args.grid)?;
+    let Some(first) = settings.first() else { return Err(Failure::work("no scene")) };
+    let points = points::expand(&base, &dials, args.grid, &first.stage)?;
     let store = Store::open(&args.output, args.resume)?;
     let mut sweep = Sweep { args, source, points, store, pools: Pools::default() };
     let groups = sweep.measure(&settings)?;
@@ -90,7 +91,8 @@ fn base(args: &SweepArgs) -> Result<Options, Failure> {
     let pack = source::is_pack(&args.input).then_some(args.input.as_path());
     points::check_names("--dial", &args.dial, pack)?;
     points::check_names("--set", &args.set, pack)?;
-    let mut base = Options::default();
+    // Not `auto`, which chooses the dials itself.
+    let mut base = Options::default().with("method", "compensated");
     if let Some(threads) = args.threads {
         base = base.with("threads", &threads.to_string());
     }
@@ -131,7 +133,10 @@ fn settings(args: &SweepArgs) -> Result<Vec<Setting>, Failure> {
             let mut changes = render::changes(&render);
             (changes.width, changes.height) = (Some(size[0]), Some(size[1]));
             let stage = Stage::read(scene, &changes)?;
-            let orders = (render.order == ScatteringOrder::Single).then_some(1);
+            let orders = match render.order {
+                ScatteringOrders::All => None,
+                ScatteringOrders::UpTo(orders) => Some(orders),
+            };
             all.push(Setting { scene: scene.clone(), axes: axes.clone(), stage, orders });
         }
     }
@@ -286,10 +291,10 @@ impl Sweep<'_> {
         if let Some(outcome) = self.store.find(&key) {
             return Ok((key, outcome));
         }
-        let (settings, repeat) = (render::settings(&render)?, self.args.repeat);
+        let (method, repeat) = (Method::choose(&render, &setting.stage)?, self.args.repeat);
         let position = self.source.position(i);
         let pool = self.pools.get(render.threads.unwrap_or(0))?;
-        let rendered = pool.install(|| measure::render(pack, position, settings, &setting.stage, repeat))?;
+        let rendered = pool.install(|| measure::render(pack, position, &method, &setting.stage, repeat))?;
         let threads = pool.current_num_threads();
         let outcome = match rendered {
             Err(why) => Outcome::Refused(why),
@@ -304,7 +309,9 @@ impl Sweep<'_> {
                     Ok(d) => {
                         image::write_png(&self.store.picture(&key), &truth.exposed(&radiance))?;
                         image::write_png(&self.store.difference(&key), &truth.false_colour(&radiance, &alpha)?)?;
-                        let mut document = render::document(&render, &settings, &setting.stage.scene)["render"].take();
+                        let mut document = method.document();
+                        let word = |name: &str| document[name].as_str().map(str::to_owned);
+                        let method = [word("method"), word("route")].into_iter().flatten().collect::<Vec<_>>().join(" ");
                         document["threads"] = json!(threads);
                         let at_rest: u64 = pack.frames().iter().map(|f| f.bytes_at_rest).sum();
                         let active: u64 = pack.frames().iter().map(|f| f.active_voxels).sum();
@@ -316,7 +323,7 @@ impl Sweep<'_> {
                             seconds,
                             pack_bytes: pack.file_bytes(),
                             bits_per_active_voxel: 8.0 * at_rest as f64 / active.max(1) as f64,
-                            method: document["route"].as_str().unwrap_or_default().to_owned(),
+                            method,
                             settings: document,
                         }))
                     }

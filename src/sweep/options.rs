@@ -46,11 +46,6 @@ impl Options {
         options
     }
 
-    /// The value of an option, if it is set.
-    pub fn get(&self, name: &str) -> Option<&str> {
-        self.0.iter().find(|(known, _)| known == name).map(|(_, value)| value.as_str())
-    }
-
     /// Name and value of each.
     pub fn iter(&self) -> impl Iterator<Item = (&str, &str)> {
         self.0.iter().map(|(name, value)| (name.as_str(), value.as_str()))
@@ -146,7 +141,8 @@ fn parse<'a, A: Args + FromArgMatches>(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::render;
+    use crate::method::Method;
+    use crate::testing::stage;
 
     fn message(failure: Failure) -> String {
         match failure {
@@ -159,7 +155,7 @@ mod tests {
     fn options_become_the_arguments_that_the_command_line_would_give() {
         let options = Options::default().with("sh-order", "2").with("gaussians", "50").with("sh-order", "3");
         let render = options.render().unwrap();
-        assert_eq!((render.sh_order, options.get("gaussians")), (3, Some("50")));
+        assert_eq!((render.sh_order, options.iter().count()), (3, 2));
         let bake = options.bake(Path::new("in.####.vdb"), Path::new("out.smoke"), "-3,5", true).unwrap();
         assert_eq!((bake.gaussians, bake.resume, bake.output.to_str()), (50, true, Some("out.smoke")));
         assert!(bake.frames.is_some());
@@ -173,7 +169,7 @@ mod tests {
         let bad = Options::default().with("sh-order", "9").render().unwrap_err();
         assert!(message(bad).contains("9 is not in 1..=6"));
         let args = Options::default().with("exponential", "linear").render().unwrap();
-        assert!(message(render::settings(&args).unwrap_err()).contains("--exponential"));
+        assert!(message(Method::choose(&args, &stage()).unwrap_err()).contains("--exponential"));
     }
 
     #[test]

@@ -1,18 +1,19 @@
 //! Which settings a sweep measures.
 //!
 //! By default a star: from the defaults of each method, one dial is turned at a time, so that d dials of v values cost
-//! `1 + d v` points and not `v^d`. A method is a value of `route`; a dial that a method refuses has no arm in its star,
-//! and a dial that no swept method takes is tried on the others (`exponential` brings `route=centres` with it). With
-//! `--grid` it is the full product, without the combinations that do not go together.
+//! `1 + d v` points and not `v^d`. Methods are the values of `method` and `route`; a dial that a method refuses has no arm
+//! in its star, and a dial that no swept method takes is tried on the other routes (`exponential` brings `route=centres`
+//! with it). With `--grid` it is the full product, without the combinations that do not go together.
 
 use super::options::{self, Options, Owner};
 use crate::cli::Assignment;
 use crate::failure::Failure;
-use crate::render;
+use crate::method::Method;
+use crate::staging::Stage;
 use clap::error::ErrorKind;
 
-/// The option whose values are the methods.
-const METHOD: &str = "route";
+/// The options whose values are the methods.
+const METHODS: [&str; 2] = ["method", "route"];
 
 /// Name of the dial of a star's middle.
 pub const DEFAULTS: &str = "defaults";
@@ -35,27 +36,19 @@ pub struct Point {
 ///
 /// # Errors
 /// A value that its option does not take, as wrong usage of that option; a dial that applies nowhere.
-pub fn expand(base: &Options, dials: &[Assignment], product: bool) -> Result<Vec<Point>, Failure> {
-    if product { combine(base, dials) } else { star(base, dials) }
+pub fn expand(base: &Options, dials: &[Assignment], product: bool, stage: &Stage) -> Result<Vec<Point>, Failure> {
+    if product { combine(base, dials, stage) } else { star(base, dials, stage) }
 }
 
-fn star(base: &Options, dials: &[Assignment]) -> Result<Vec<Point>, Failure> {
-    let middle = |value: Option<&str>| Point {
-        dial: DEFAULTS.into(),
-        value: String::new(),
-        options: value.map_or(base.clone(), |value| base.with(METHOD, value)),
-    };
-    let methods: Vec<&String> = dials.iter().filter(|d| d.name == METHOD).flat_map(|d| &d.values).collect();
-    let mut middles: Vec<Point> = methods.iter().map(|value| middle(Some(value))).collect();
-    if middles.is_empty() {
-        middles.push(middle(None));
-    }
-    for middle in &middles {
-        check(&middle.options)?;
-    }
+fn star(base: &Options, dials: &[Assignment], stage: &Stage) -> Result<Vec<Point>, Failure> {
+    let check = |options: &Options| check(options, stage);
+    let middle = |options| Point { dial: DEFAULTS.into(), value: String::new(), options };
+    let (methods, dials): (Vec<_>, Vec<_>) = dials.iter().cloned().partition(|d| METHODS.contains(&d.name.as_str()));
+    let mut middles = combine(base, &methods, stage)?;
+    middles.iter_mut().for_each(|point| *point = middle(point.options.clone()));
     let swept = middles.len();
     let mut arms = Vec::new();
-    for dial in dials.iter().filter(|d| d.name != METHOD) {
+    for dial in &dials {
         for value in &dial.values {
             let arm = |from: &Point| Point {
                 dial: dial.name.clone(),
@@ -74,8 +67,9 @@ fn star(base: &Options, dials: &[Assignment]) -> Result<Vec<Point>, Failure> {
             if arms.len() > before {
                 continue;
             }
-            let others = options::possible_values(METHOD).into_iter().map(|other| middle(Some(&other)));
-            let other = others.into_iter().find(|other| check(&arm(other).options).is_ok());
+            let routes = options::possible_values("route").into_iter();
+            let mut others = routes.map(|route| middle(base.with("route", &route)));
+            let other = others.find(|other| check(&arm(other).options).is_ok());
             match (other, refused) {
                 (Some(other), _) => {
                     arms.push(arm(&other));
@@ -92,7 +86,7 @@ fn star(base: &Options, dials: &[Assignment]) -> Result<Vec<Point>, Failure> {
     Ok(middles)
 }
 
-fn combine(base: &Options, dials: &[Assignment]) -> Result<Vec<Point>, Failure> {
+fn combine(base: &Options, dials: &[Assignment], stage: &Stage) -> Result<Vec<Point>, Failure> {
     let mut all = vec![(Vec::new(), base.clone())];
     for dial in dials {
         let turned = |(words, options): &(Vec<String>, Options)| -> Vec<(Vec<String>, Options)> {
@@ -107,7 +101,7 @@ fn combine(base: &Options, dials: &[Assignment]) -> Result<Vec<Point>, Failure> 
     let mut points = Vec::new();
     let mut refused = None;
     for (words, options) in all {
-        match check(&options) {
+        match check(&options, stage) {
             Ok(()) => points.push(Point { dial: COMBINED.into(), value: words.join(" "), options }),
             Err(failure) => refused = refused.or(Some(conflict(failure)?)),
         }
@@ -119,8 +113,8 @@ fn combine(base: &Options, dials: &[Assignment]) -> Result<Vec<Point>, Failure> 
 }
 
 /// Whether the options parse, and apply to each other.
-fn check(options: &Options) -> Result<(), Failure> {
-    render::settings(&options.render()?)?;
+fn check(options: &Options, stage: &Stage) -> Result<(), Failure> {
+    Method::choose(&options.render()?, stage)?;
     options.bake("volumes".as_ref(), "pack".as_ref(), "1", false).map(|_| ())
 }
 
@@ -136,7 +130,7 @@ fn conflict(failure: Failure) -> Result<Failure, Failure> {
 /// side of its default. Bake dials only if the input is volumes, whose largest density is `density_max`.
 pub fn usual(density_max: Option<f32>) -> Vec<Assignment> {
     let mut dials = vec![
-        (METHOD, "grid,centres".to_owned()),
+        ("route", "grid,centres".to_owned()),
         ("order", "single".into()),
         ("sh-order", "1,2,3,6".into()),
         ("beams", "16,256".into()),
@@ -147,6 +141,7 @@ pub fn usual(density_max: Option<f32>) -> Vec<Assignment> {
         ("cutoff", "0.01,0.05,0.2".into()),
         ("exponential", "pointwise,hybrid,linear".into()),
         ("multiple", "diffusion".into()),
+        ("samples", "2".into()),
         ("half-resolution", "true".into()),
         ("threads", "1".into()),
     ];
@@ -189,6 +184,7 @@ pub fn check_names(option: &str, given: &[Assignment], pack: Option<&std::path::
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::stage;
 
     fn dials(text: &[&str]) -> Vec<Assignment> {
         let dial = |text: &&str| {
@@ -207,7 +203,7 @@ mod tests {
     }
 
     fn expanded(text: &[&str], product: bool) -> Vec<String> {
-        names(&expand(&Options::default(), &dials(text), product).unwrap_or_else(|_| panic!("{text:?}")))
+        names(&expand(&Options::default(), &dials(text), product, &stage()).unwrap_or_else(|_| panic!("{text:?}")))
     }
 
     #[test]
@@ -267,7 +263,7 @@ mod tests {
             (&["route=nowhere"], false),
             (&["max-error=-1"], false),
         ] {
-            let failure = expand(&Options::default(), &dials(text), product);
+            let failure = expand(&Options::default(), &dials(text), product, &stage());
             assert!(matches!(failure, Err(Failure::Usage(_))), "{text:?}");
         }
     }
@@ -292,9 +288,9 @@ mod tests {
         assert!(check_names("--dial", &render_only, Some("a.smoke".as_ref())).is_ok());
         assert_eq!(all.len(), render_only.len() + 2);
         assert_eq!(all.last().unwrap().values[2], "0.02");
-        let points = expand(&Options::default(), &all, false).unwrap();
+        let points = expand(&Options::default(), &all, false, &stage()).unwrap();
         for dial in &all {
-            assert!(dial.name == METHOD || points.iter().any(|p| p.dial == dial.name), "{}", dial.name);
+            assert!(dial.name == "route" || points.iter().any(|p| p.dial == dial.name), "{}", dial.name);
         }
         assert!(usual(Some(0.0)).last().unwrap().values.iter().all(|v| v.parse::<f64>().unwrap() > 0.0));
     }

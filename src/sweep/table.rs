@@ -4,19 +4,26 @@ use super::store::Key;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
 
-/// Wall seconds of one render by stage, the median of all renders of a point.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+/// Wall seconds of one render, the median of all renders of a point.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Seconds {
-    /// Reading and decoding the frame.
-    pub decode: f64,
-    /// Density and lights to source radiance.
-    pub source_radiance: f64,
-    /// Source radiance to nodes, for the eye.
-    pub volume_pass: f64,
-    /// The march.
-    pub view_pass: f64,
+    /// Seconds by the name of the stage, in order: `decode`, then those of the method.
+    #[serde(flatten)]
+    pub stages: Map<String, Value>,
     /// All of it.
     pub total: f64,
+}
+
+impl Seconds {
+    /// The seconds of each stage, and their sum.
+    pub fn new<'a>(stages: impl Iterator<Item = (&'a str, f64)>) -> Self {
+        let mut seconds = Self::default();
+        for (name, value) in stages {
+            seconds.stages.insert(name.to_owned(), json!(value));
+            seconds.total += value;
+        }
+        seconds
+    }
 }
 
 /// What was measured at one point. Errors are relative to the reference, over the pixels where either image has alpha
@@ -37,7 +44,7 @@ pub struct Figures {
     pub pack_bytes: u64,
     /// Bits of the pack's frames at rest for each active voxel.
     pub bits_per_active_voxel: f64,
-    /// `grid` or `centres`, as the settings have it.
+    /// The method, with its route if it has several.
     pub method: String,
     /// Every setting, as `render` stores it in an image, and the threads.
     pub settings: Value,
@@ -114,66 +121,47 @@ pub struct Group {
     pub refused: Vec<[String; 3]>,
 }
 
-/// Columns of a row after those of the axes.
-const COLUMNS: [&str; 17] = [
-    "frame",
-    "method",
-    "dial",
-    "value",
-    "relative_rmse",
-    "relative_rmse_standard_error",
-    "bias",
-    "bias_standard_error",
-    "decode_seconds",
-    "source_radiance_seconds",
-    "volume_pass_seconds",
-    "view_pass_seconds",
-    "total_seconds",
-    "pack_bytes",
-    "bits_per_active_voxel",
-    "bake",
-    "settings",
-];
-
 /// All rows as CSV (RFC 4180, but lines end in LF), a line of names first. Axes are the second and following columns.
 pub fn csv(groups: &[Group]) -> String {
-    let axes: Vec<&str> = groups.first().map_or(vec![], |g| g.place.axes.iter().map(|(name, _)| name.as_str()).collect());
-    let head = ["scene"].into_iter().chain(axes).chain(COLUMNS);
-    let mut out = record(head.map(str::to_owned));
-    for row in groups.iter().flat_map(|g| &g.rows) {
-        let (f, s) = (&row.figures, &row.figures.seconds);
-        let axes = row.place.axes.iter().map(|(_, value)| value.clone());
-        let fields = [
-            row.place.frame.to_string(),
-            f.method.clone(),
-            row.dial.clone(),
-            row.value.clone(),
-            f.relative_rmse.to_string(),
-            f.relative_rmse_standard_error.to_string(),
-            f.bias.to_string(),
-            f.bias_standard_error.to_string(),
-            s.decode.to_string(),
-            s.source_radiance.to_string(),
-            s.volume_pass.to_string(),
-            s.view_pass.to_string(),
-            s.total.to_string(),
-            f.pack_bytes.to_string(),
-            f.bits_per_active_voxel.to_string(),
-            row.bake.clone(),
-            f.settings.to_string(),
-        ];
-        out += &record([row.place.scene.clone()].into_iter().chain(axes).chain(fields));
+    let rows = || groups.iter().flat_map(|g| &g.rows);
+    let axes = groups.first().map_or(&[][..], |g| &g.place.axes).iter().map(|(name, _)| name.clone());
+    let mut stages: Vec<&String> = Vec::new();
+    for name in rows().flat_map(|row| row.figures.seconds.stages.keys()) {
+        if !stages.contains(&name) {
+            stages.push(name);
+        }
+    }
+    let names = |names: &[&str]| names.iter().map(|name| (*name).to_owned()).collect::<Vec<_>>();
+    let mut head = names(&["scene"]);
+    head.extend(axes);
+    head.extend(names(&["frame", "method", "dial", "value"]));
+    head.extend(names(&["relative_rmse", "relative_rmse_standard_error", "bias", "bias_standard_error"]));
+    head.extend(stages.iter().map(|stage| format!("{stage}_seconds")));
+    head.extend(names(&["total_seconds", "pack_bytes", "bits_per_active_voxel", "bake", "settings"]));
+    let mut out = record(head);
+    for row in rows() {
+        let (place, f) = (&row.place, &row.figures);
+        let mut fields = vec![place.scene.clone()];
+        fields.extend(place.axes.iter().map(|(_, value)| value.clone()));
+        fields.extend([place.frame.to_string(), f.method.clone(), row.dial.clone(), row.value.clone()]);
+        let errors = [f.relative_rmse, f.relative_rmse_standard_error, f.bias, f.bias_standard_error];
+        fields.extend(errors.map(|v| v.to_string()));
+        // A stage that this method does not have is empty, not zero.
+        fields.extend(stages.iter().map(|&stage| f.seconds.stages.get(stage).map_or(String::new(), Value::to_string)));
+        fields.extend([f.seconds.total.to_string(), f.pack_bytes.to_string(), f.bits_per_active_voxel.to_string()]);
+        fields.extend([row.bake.clone(), f.settings.to_string()]);
+        out += &record(fields);
     }
     out
 }
 
 /// One line of CSV.
-fn record(fields: impl Iterator<Item = String>) -> String {
+fn record(fields: Vec<String>) -> String {
     let field = |text: String| match text.contains(['"', ',', '\n', '\r']) {
         true => format!("\"{}\"", text.replace('"', "\"\"")),
         false => text,
     };
-    fields.map(field).collect::<Vec<_>>().join(",") + "\n"
+    fields.into_iter().map(field).collect::<Vec<_>>().join(",") + "\n"
 }
 
 /// All of a sweep as one document; `sweep` is what was asked for.
@@ -231,7 +219,7 @@ pub mod tests {
                 relative_rmse_standard_error: 0.001,
                 bias: -0.5 * error,
                 bias_standard_error: 0.0005,
-                seconds: Seconds { view_pass: total, total, ..Seconds::default() },
+                seconds: Seconds::new([("decode", 0.25 * total), ("view_pass", 0.75 * total)].into_iter()),
                 pack_bytes: 1000,
                 bits_per_active_voxel: 4.5,
                 method: method.into(),

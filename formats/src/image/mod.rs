@@ -16,7 +16,9 @@ mod read_hdr;
 mod write_exr;
 mod write_png;
 
-pub use write_exr::{FrameMetadata, RenderedFrame, SETTINGS_ATTRIBUTE, SamplePrecision, write_channels, write_frame};
+pub use write_exr::{
+    FrameMetadata, RenderedFrame, SETTINGS_ATTRIBUTE, STANDARD_ERROR, SamplePrecision, write_channels, write_frame,
+};
 pub use write_png::write_png;
 
 use crate::{Error, Result};

@@ -3,6 +3,7 @@
 //! Channels: `R`, `G`, `B` premultiplied linear Rec.709; `A` = 1 - mean transmittance; `Z` = front depth, the distance
 //! along the view in world units (camera space z), always in float, and `+inf` where nothing was hit, so that the
 //! smaller Z wins wherever two frames are merged. Half is what compositing expects of colour; float keeps everything.
+//! An estimate also has `standard_error.R`, `.G`, `.B`: the standard error of each sample of R, G, B, always in float.
 //!
 //! Attributes: `software`, `framesPerSecond`, `worldToCamera`, `worldToNDC` (conventions: `projection`),
 //! `chromaticities` (Rec.709, D65) and one own attribute, `smokebake:settings`, JSON text. It has to be ONE: the `exr`
@@ -21,6 +22,9 @@ use std::path::Path;
 
 /// Name of our own attribute.
 pub const SETTINGS_ATTRIBUTE: &str = "smokebake:settings";
+
+/// Channels of the standard error of R, G and B.
+pub const STANDARD_ERROR: [&str; 3] = ["standard_error.R", "standard_error.G", "standard_error.B"];
 
 /// How R, G, B and A are stored. Z is float in both.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -45,6 +49,8 @@ pub struct RenderedFrame<'a> {
     pub alpha: &'a [f32],
     /// Front depth in world units along the view; `+inf` where nothing was hit. Never NaN.
     pub depth: &'a [f32],
+    /// Standard error of the mean radiance, if the frame is an estimate; finite.
+    pub standard_error: Option<&'a [[f32; 3]]>,
 }
 
 /// What a frame says about itself.
@@ -70,9 +76,12 @@ pub fn write_frame(
     metadata: &FrameMetadata,
     precision: SamplePrecision,
 ) -> Result<usize> {
-    check_size(path, frame.width as u64, frame.height as u64, 5)?;
+    check_size(path, frame.width as u64, frame.height as u64, if frame.standard_error.is_some() { 8 } else { 5 })?;
     let pixels = frame.width * frame.height;
-    for (what, length) in [("R, G, B", frame.rgb.len()), ("A", frame.alpha.len()), ("Z", frame.depth.len())] {
+    let errors = frame.standard_error.map_or(pixels, <[_]>::len);
+    for (what, length) in
+        [("R, G, B", frame.rgb.len()), ("A", frame.alpha.len()), ("Z", frame.depth.len()), ("standard error", errors)]
+    {
         if length != pixels {
             return Err(Error::invalid(path, format!("samples of {what}"), length, pixels));
         }
@@ -94,6 +103,13 @@ pub fn write_frame(
     }
     check_samples(path, "Z", frame.depth, frame.width, |v| !v.is_nan())?;
     channels.push(AnyChannel::new("Z", FlatSamples::F32(frame.depth.to_vec())));
+    for (c, name) in STANDARD_ERROR.into_iter().enumerate() {
+        if let Some(errors) = frame.standard_error {
+            let values: Vec<f32> = errors.iter().map(|e| e[c]).collect();
+            check_samples(path, name, &values, frame.width, |v| v.is_finite())?;
+            channels.push(AnyChannel::new(name, FlatSamples::F32(values)));
+        }
+    }
 
     let matrix = |m: &RowMatrix| std::array::from_fn(|i| m[i / 4][i % 4] as f32);
     let mut attributes = LayerAttributes {
@@ -186,7 +202,7 @@ mod tests {
     const DEPTH: [f32; 6] = [f32::INFINITY, 1.25, 1e6, 3.1, 1e-6, 2.0];
 
     fn frame() -> RenderedFrame<'static> {
-        RenderedFrame { width: 3, height: 2, rgb: &RGB, alpha: &ALPHA, depth: &DEPTH }
+        RenderedFrame { width: 3, height: 2, rgb: &RGB, alpha: &ALPHA, depth: &DEPTH, standard_error: None }
     }
 
     fn metadata() -> FrameMetadata {

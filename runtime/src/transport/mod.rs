@@ -2,6 +2,7 @@
 
 pub mod compensated;
 pub mod medium;
+pub mod reference;
 
 use crate::march::ShadedVolume;
 use crate::medium::field::DensityField;

@@ -1,0 +1,127 @@
+//! The lights as the path tracer asks for them: one light of infinity drawn by its power, and points.
+
+use super::sky::Sky;
+use crate::light::Light;
+use glam::{DVec3, Vec3};
+
+/// A light of infinity.
+enum Distant {
+    Sky(Sky),
+    Sun { toward: Vec3, irradiance: Vec3 },
+}
+
+/// All lights of a scene.
+#[derive(Default)]
+pub struct Lights {
+    distant: Vec<Distant>,
+    /// Sum of the parts of the power up to and with each; the last is 1.
+    chances: Vec<f32>,
+    /// Position in world space, and radiant intensity in W/sr.
+    pub points: Vec<(DVec3, Vec3)>,
+}
+
+/// Light from one drawn direction.
+pub struct Drawn {
+    /// Unit vector to the light.
+    pub toward: Vec3,
+    /// Radiance over the density of the draw, W / m^2.
+    pub irradiance: Vec3,
+    /// Density over solid angle with which the direction is drawn; infinite for a sun.
+    pub density: f32,
+}
+
+impl Lights {
+    /// Tables for `lights`; black ones are left out.
+    pub fn new(lights: &[Light]) -> Self {
+        let mut all = Self::default();
+        let mut powers = Vec::new();
+        for light in lights {
+            match light {
+                Light::Environment(environment) => {
+                    if let Some(sky) = Sky::new(environment) {
+                        powers.push(sky.flux());
+                        all.distant.push(Distant::Sky(sky));
+                    }
+                }
+                Light::Directional { toward, irradiance } => {
+                    let irradiance = Vec3::from_array(*irradiance);
+                    if irradiance.max_element() > 0.0 {
+                        powers.push(f64::from(irradiance.element_sum()) / 3.0);
+                        all.distant.push(Distant::Sun { toward: *toward, irradiance });
+                    }
+                }
+                Light::Point { position, intensity } => {
+                    let intensity = Vec3::from_array(*intensity);
+                    if intensity.max_element() > 0.0 {
+                        all.points.push((*position, intensity));
+                    }
+                }
+            }
+        }
+        let total = powers.iter().sum::<f64>();
+        let mut sum = 0.0;
+        all.chances = powers
+            .iter()
+            .map(|p| {
+                sum += p;
+                (sum / total) as f32
+            })
+            .collect();
+        if let Some(last) = all.chances.last_mut() {
+            *last = 1.0;
+        }
+        all
+    }
+
+    /// True if there is light from infinity.
+    pub fn has_distant(&self) -> bool {
+        !self.distant.is_empty()
+    }
+
+    /// True if there is light that a scattered ray can run into.
+    pub fn has_sky(&self) -> bool {
+        self.distant.iter().any(|d| matches!(d, Distant::Sky(_)))
+    }
+
+    fn chance(&self, i: usize) -> f32 {
+        self.chances[i] - if i == 0 { 0.0 } else { self.chances[i - 1] }
+    }
+
+    /// Light from a direction drawn by `choice` and `u`, all in [0, 1); there must be some.
+    #[inline]
+    pub fn draw(&self, choice: f32, u: [f32; 2]) -> Drawn {
+        let i = self.chances.partition_point(|&c| c <= choice).min(self.distant.len() - 1);
+        let chance = self.chance(i);
+        match &self.distant[i] {
+            Distant::Sky(sky) => {
+                let drawn = sky.sample(u);
+                let density = drawn.density * chance;
+                Drawn { toward: drawn.direction, irradiance: Vec3::from_array(drawn.radiance) / density, density }
+            }
+            Distant::Sun { toward, irradiance } => {
+                Drawn { toward: *toward, irradiance: *irradiance / chance, density: f32::INFINITY }
+            }
+        }
+    }
+
+    /// Radiance that a ray along `way` runs into, each sky by the share of it that is not [`Self::draw`]'s, when `way`
+    /// was drawn with `density` (power heuristic: Veach 1997, section 9.2.4).
+    #[inline]
+    pub fn run_into(&self, way: Vec3, density: f32) -> Vec3 {
+        let mut sum = Vec3::ZERO;
+        for (i, distant) in self.distant.iter().enumerate() {
+            if let Distant::Sky(sky) = distant {
+                let seen = sky.seen(way);
+                sum += Vec3::from_array(seen.radiance) * share(density, seen.density * self.chance(i));
+            }
+        }
+        sum
+    }
+}
+
+/// Part of the first of two densities by the power heuristic; an infinite second one takes all.
+#[inline(always)]
+pub fn share(of: f32, other: f32) -> f32 {
+    let ratio = other / of;
+    1.0 / (1.0 + ratio * ratio)
+}

@@ -1,0 +1,113 @@
+//! The methods that `render` and its kin make images by, treated alike: options in, a frame's image and its story out.
+
+use crate::cli::{MethodChoice, RenderArgs};
+use crate::failure::Failure;
+use crate::staging::Stage;
+use crate::{compensated, reference};
+use clap::error::ErrorKind;
+use serde_json::{Value, json};
+use smoke_runtime::film::Film;
+use smoke_runtime::light::Light;
+use smoke_runtime::medium::frame::Frame;
+use smoke_runtime::renderer::{RenderSettings, Renderer, Seconds};
+use smoke_runtime::transport::reference::{ReferenceSettings, trace};
+use std::time::Instant;
+
+/// A method with its settings.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Method {
+    /// Source radiance and a march.
+    Compensated(RenderSettings),
+    /// Path tracing.
+    Reference(ReferenceSettings),
+}
+
+/// A method ready for frames of one scene.
+pub enum Maker<'a> {
+    /// Keeps what frames have in common.
+    Compensated(Box<Renderer>, &'a Stage),
+    /// Keeps nothing.
+    Reference(ReferenceSettings, &'a Stage),
+}
+
+/// One frame's image.
+pub struct Image {
+    /// The pixels.
+    pub film: Film,
+    /// Standard error of each pixel's radiance, where the image is an estimate.
+    pub standard_error: Option<Vec<[f32; 3]>>,
+    /// Wall seconds of each stage, by name.
+    pub seconds: Vec<(&'static str, f64)>,
+    /// Further figures for `--json`.
+    pub figures: Value,
+}
+
+/// Refuses an option that the choice of another makes void.
+pub fn does_not_apply(given: bool, option: &str, with: &str) -> Result<(), clap::Error> {
+    match given {
+        true => Err(clap::Error::raw(
+            ErrorKind::ArgumentConflict,
+            format!("{option} does not apply to {with}; leave it out, or change the other\n"),
+        )),
+        false => Ok(()),
+    }
+}
+
+impl Method {
+    /// The method that the options ask for; `stage` decides where they leave it open.
+    pub fn choose(args: &RenderArgs, stage: &Stage) -> Result<Self, Failure> {
+        let point = stage.lights.iter().any(|light| matches!(light, Light::Point { .. }));
+        match args.method {
+            MethodChoice::Reference => reference::settings(args).map(Self::Reference),
+            MethodChoice::Auto if point => reference::settings(args).map(Self::Reference),
+            MethodChoice::Auto | MethodChoice::Compensated => compensated::settings(args).map(Self::Compensated),
+        }
+    }
+
+    /// Name and settings, as an image's metadata has them.
+    pub fn document(&self) -> Value {
+        match self {
+            Self::Compensated(settings) => compensated::document(settings),
+            Self::Reference(settings) => reference::document(settings),
+        }
+    }
+
+    /// Ready for frames under the lights and medium of `stage`.
+    pub fn maker<'a>(&self, stage: &'a Stage) -> Result<Maker<'a>, String> {
+        Ok(match self {
+            Self::Compensated(settings) => {
+                let renderer = Renderer::new(*settings, stage.medium, stage.lights.clone());
+                Maker::Compensated(Box::new(renderer.map_err(|e| e.to_string())?), stage)
+            }
+            Self::Reference(settings) => Maker::Reference(*settings, stage),
+        })
+    }
+}
+
+impl Maker<'_> {
+    /// The image of `frame`; `done` is told which part of it is finished, from 0 to 1.
+    pub fn image(&mut self, frame: Frame, done: &mut dyn FnMut(f64)) -> Result<Image, String> {
+        let start = Instant::now();
+        match self {
+            Self::Compensated(renderer, stage) => {
+                renderer.set_frame(frame).map_err(|e| e.to_string())?;
+                let prepared = start.elapsed().as_secs_f64();
+                let (film, seconds) = renderer.render(&stage.camera).map_err(|e| e.to_string())?;
+                let Seconds { source_radiance, volume_pass, view_pass } = seconds;
+                let source_radiance = source_radiance + prepared;
+                let stages =
+                    [("source_radiance", source_radiance), ("volume_pass", volume_pass), ("view_pass", view_pass)];
+                Ok(Image { film, standard_error: None, seconds: stages.to_vec(), figures: json!({}) })
+            }
+            Self::Reference(settings, stage) => {
+                let mut on_pass = |passes, error| done(reference::part_done(settings, passes, error));
+                let Stage { medium, lights, camera, .. } = stage;
+                let traced = trace(&frame.field, medium, lights, camera, settings, &mut on_pass);
+                let traced = traced.map_err(|e| e.to_string())?;
+                let figures = reference::figures(&traced);
+                let seconds = vec![("trace", start.elapsed().as_secs_f64())];
+                Ok(Image { film: traced.film, standard_error: Some(traced.standard_error), seconds, figures })
+            }
+        }
+    }
+}
