@@ -2,9 +2,9 @@
 
 use super::store::ReferenceImage;
 use super::table::{Progressed, ReferenceFigures, Seconds};
-use crate::method::Method;
 use crate::contact_sheet;
 use crate::failure::Failure;
+use crate::method::Method;
 use crate::staging::Stage;
 use smoke_formats::image::RgbImage;
 use smoke_formats::pack::Pack;
@@ -123,7 +123,8 @@ impl ReferenceImage {
     pub fn false_colour(&self, radiance: &[[f32; 3]], alpha: &[f32]) -> Result<RgbImage, Failure> {
         let mask = image_difference::seen(alpha, Some(&self.alpha));
         let samples = self.radiance.iter().zip(&mask).filter(|(_, seen)| **seen).flat_map(|(p, _)| p);
-        let (sum, count) = samples.fold((0.0, 0.0), |(sum, count), &v| (sum + f64::from(v) * f64::from(v), count + 1.0));
+        let (sum, count) =
+            samples.fold((0.0, 0.0), |(sum, count), &v| (sum + f64::from(v) * f64::from(v), count + 1.0));
         let scale = FULL_COLOUR * (sum / f64::max(count, 1.0)).sqrt();
         let pair = Pair { width: self.width, test: radiance, reference: &self.radiance, mask: Some(&mask) };
         let pixels = image_difference::false_colour(&pair, if scale > 0.0 { scale } else { 1.0 });

@@ -8,10 +8,11 @@
 //! | `measure` | a reference; a point against it |
 //! | `store` | the folder, and what a later run finds in it |
 //! | `table` | rows as CSV and JSON |
-//! | `plot`, `page`, `style.css` | the page of plots |
+//! | `plot`, `charts`, `page`, `style.css` | the page of plots |
 //!
 //! For each scene, combination of axes and frame: one reference, then every point. Bakes come first.
 
+mod charts;
 mod measure;
 mod options;
 mod page;
@@ -223,7 +224,8 @@ impl Sweep<'_> {
         let (mut rows, mut refused) = (Vec::new(), Vec::new());
         for index in 0..self.points.len() {
             let point = self.points[index].clone();
-            let turned = if point.value.is_empty() { point.dial.clone() } else { format!("{} {}", point.dial, point.value) };
+            let turned =
+                if point.value.is_empty() { point.dial.clone() } else { format!("{} {}", point.dial, point.value) };
             progress.describe(format!("frame {}, {turned}", place.frame));
             let bake = point.options.of(Owner::Bake);
             let Some(pack) = packs.get(&bake) else { continue };
@@ -311,7 +313,8 @@ impl Sweep<'_> {
                         image::write_png(&self.store.difference(&key), &truth.false_colour(&radiance, &alpha)?)?;
                         let mut document = method.document();
                         let word = |name: &str| document[name].as_str().map(str::to_owned);
-                        let method = [word("method"), word("route")].into_iter().flatten().collect::<Vec<_>>().join(" ");
+                        let method =
+                            [word("method"), word("route")].into_iter().flatten().collect::<Vec<_>>().join(" ");
                         document["threads"] = json!(threads);
                         let at_rest: u64 = pack.frames().iter().map(|f| f.bytes_at_rest).sum();
                         let active: u64 = pack.frames().iter().map(|f| f.active_voxels).sum();

@@ -127,7 +127,10 @@ impl Store {
     pub fn keep<T: Serialize>(&mut self, key: &Key, result: &T) -> Result<(), Failure> {
         let text = line(&Entry { key: key.clone(), result })?;
         let path = self.folder.join(JOURNAL);
-        self.journal.write_all(text.as_bytes()).and_then(|()| self.journal.sync_data()).map_err(|e| Error::io(&path, e))?;
+        self.journal
+            .write_all(text.as_bytes())
+            .and_then(|()| self.journal.sync_data())
+            .map_err(|e| Error::io(&path, e))?;
         let value = serde_json::to_value(result).map_err(|e| Failure::work(format!("{}: {e}", path.display())))?;
         self.known.insert(key.clone(), value);
         Ok(())
@@ -239,7 +242,8 @@ mod tests {
 
     #[test]
     fn keys_tell_apart_what_differs_and_how_it_is_cut_into_parts() {
-        let all = [Key::of(&["a", "b"]), Key::of(&["ab"]), Key::of(&["a", "b", ""]), Key::of(&["b", "a"]), Key::of(&[])];
+        let all =
+            [Key::of(&["a", "b"]), Key::of(&["ab"]), Key::of(&["a", "b", ""]), Key::of(&["b", "a"]), Key::of(&[])];
         for (i, a) in all.iter().enumerate() {
             assert_eq!(a.as_str().len(), 32);
             assert!(all[..i].iter().all(|b| a != b));
