@@ -46,7 +46,7 @@ pub struct SweepArgs {
     /// Instead of the scene's height [default: in proportion].
     #[arg(long, value_name = "PIXELS", value_parser = clap::value_parser!(u32).range(1..=65536))]
     pub height: Option<u32>,
-    /// Relative standard error at which a reference is good enough.
+    /// Relative standard error of the whole image at which a reference is good enough.
     #[arg(long, value_name = "ERROR", default_value = "0.7%", value_parser = ratio)]
     pub reference_error: f64,
     /// Renders of each point; the seconds are those of the median.
@@ -89,7 +89,8 @@ mod tests {
         let dial = |i: usize| (args.dial[i].name.as_str(), args.dial[i].values.join(" "));
         assert_eq!((dial(0), dial(1)), (("sh-order", "1 2 4".into()), ("route", "grid".into())));
         assert_eq!((args.scene.len(), args.vary[0].values[0].as_str(), args.repeat), (2, "-0.5", 3));
-        assert_eq!(args.reference_error, 0.007);
+        assert!((args.reference_error - 0.007).abs() < 1e-15);
+        assert!(parse::<SweepArgs>(&[&line[..], &["--reference-error", "0"]].concat()).is_err());
         for bad in ["sh-order", "=1", "sh-order=", "sh-order=1,,2"] {
             assert!(parse::<SweepArgs>(&[&line[..], &["--dial", bad]].concat()).is_err(), "{bad}");
         }

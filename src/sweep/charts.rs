@@ -102,7 +102,7 @@ impl Charts {
     }
 
     /// One plot of errors for each dial, all on one scale.
-    pub fn error_by_dial(&self, group: &Group) -> Vec<(String, String)> {
+    pub fn error_by_dial(&self, group: &Group) -> Vec<String> {
         let all = Scale::log(group.rows.iter().map(|row| 100.0 * drawn(row)));
         let mut plots = Vec::new();
         for dial in self.dials.iter().filter(|dial| *dial != DEFAULTS && *dial != COMBINED) {
@@ -137,7 +137,7 @@ impl Charts {
                 curves,
                 front: Vec::new(),
             };
-            plots.push((dial.clone(), plot.svg()));
+            plots.push(plot.svg());
         }
         plots
     }

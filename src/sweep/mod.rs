@@ -25,7 +25,7 @@ mod table;
 use crate::cli::{RenderArgs, ScatteringOrders, SweepArgs};
 use crate::method::Method;
 use crate::progress::Progress;
-use crate::staging::Stage;
+use crate::staging::{SceneChanges, Stage};
 use crate::{answer, failure::Failure, render};
 use measure::FULL_COLOUR;
 use options::{AXES, Options, Owner};
@@ -124,16 +124,15 @@ fn settings(args: &SweepArgs) -> Result<Vec<Setting>, Failure> {
     }
     let mut all = Vec::new();
     for scene in &args.scene {
-        let size = size(&Scene::read(scene)?, args.width, args.height);
+        let stage = Stage::read(scene, &SceneChanges::default())?;
+        let [width, height] = size(&stage.scene, args.width, args.height).map(Some);
         for axes in &combinations {
             let mut options = Options::default();
             for (name, value) in axes {
                 options = options.with(name, value);
             }
             let render = options.render()?;
-            let mut changes = render::changes(&render);
-            (changes.width, changes.height) = (Some(size[0]), Some(size[1]));
-            let stage = Stage::read(scene, &changes)?;
+            let stage = stage.changed(scene, &SceneChanges { width, height, ..render::changes(&render) })?;
             let orders = match render.order {
                 ScatteringOrders::All => None,
                 ScatteringOrders::UpTo(orders) => Some(orders),
