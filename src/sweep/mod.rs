@@ -4,6 +4,7 @@
 //! |---|---|
 //! | `options` | options of `render` and `bake` by name, parsed as the command line parses them |
 //! | `points` | which settings are measured |
+//! | `setting` | scenes with the values of the axes |
 //! | `source` | the true density, and the packs |
 //! | `measure` | a reference; a point against it |
 //! | `store` | the folder, and what a later run finds in it |
@@ -18,35 +19,33 @@ mod options;
 mod page;
 mod plot;
 mod points;
+mod setting;
 mod source;
 mod store;
 mod table;
 
-use crate::cli::{RenderArgs, ScatteringOrders, SweepArgs};
+use crate::cli::{RenderArgs, SweepArgs};
 use crate::method::Method;
 use crate::progress::Progress;
-use crate::staging::{SceneChanges, Stage};
-use crate::{answer, failure::Failure, render};
+use crate::{answer, failure::Failure};
 use measure::FULL_COLOUR;
-use options::{AXES, Options, Owner};
+use options::{Options, Owner};
 use points::Point;
 use rayon::ThreadPool;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
-use smoke_baking::survey::hash_file;
+use setting::Setting;
 use smoke_formats::pack::Pack;
-use smoke_formats::scene::{Light, Scene, Sky};
 use smoke_formats::{atomic, image};
 use source::Source;
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::collections::btree_map::Entry;
 use store::{Key, ReferenceImage, Store};
 use table::{Figures, Group, Place, ReferenceFigures, Row};
 
-/// Steps of progress of one bake, and of one reference; a point is one step.
-const LONG: u64 = 10;
-/// Pixels of an image whose size is not given.
-const PIXELS: f64 = 20_000.0;
+/// Steps of progress of one bake, and of one reference, where one render is a step: about as long on the shipped plume.
+const BAKE_STEPS: u64 = 4;
+const REFERENCE_STEPS: u64 = 10;
 
 /// What came of a point, as the journal has it.
 #[derive(Serialize, Deserialize)]
@@ -57,18 +56,10 @@ enum Outcome {
     Refused(String),
 }
 
-/// One scene file with one value for each axis.
-struct Setting {
-    scene: PathBuf,
-    axes: Vec<(String, String)>,
-    stage: Stage,
-    orders: Option<u32>,
-}
-
 /// Checks everything that was asked, measures it, and writes the three answers.
 pub fn run(args: &SweepArgs) -> Result<(), Failure> {
     let base = base(args)?;
-    let settings = settings(args)?;
+    let settings = setting::all(args)?;
     let source = Source::open(args, &base)?;
     let dials = if args.dial.is_empty() { points::usual(source.density_max()) } else { args.dial.clone() };
     let Some(first) = settings.first() else { return Err(Failure::work("no scene")) };
@@ -107,65 +98,19 @@ fn base(args: &SweepArgs) -> Result<Options, Failure> {
     Ok(base)
 }
 
-/// Every scene with every combination of the axes' values, read and checked.
-fn settings(args: &SweepArgs) -> Result<Vec<Setting>, Failure> {
-    for (i, axis) in args.vary.iter().enumerate() {
-        if !AXES.contains(&axis.name.as_str()) || args.vary[..i].iter().any(|other| other.name == axis.name) {
-            return Err(options::unknown("--vary", &axis.name, &AXES));
-        }
-    }
-    let mut combinations = vec![Vec::new()];
-    for axis in &args.vary {
-        let longer = |before: &Vec<(String, String)>| -> Vec<Vec<(String, String)>> {
-            let with = |value: &String| before.iter().cloned().chain([(axis.name.clone(), value.clone())]).collect();
-            axis.values.iter().map(with).collect()
-        };
-        combinations = combinations.iter().flat_map(longer).collect();
-    }
-    let mut all = Vec::new();
-    for scene in &args.scene {
-        let stage = Stage::read(scene, &SceneChanges::default())?;
-        let [width, height] = size(&stage.scene, args.width, args.height).map(Some);
-        for axes in &combinations {
-            let mut options = Options::default();
-            for (name, value) in axes {
-                options = options.with(name, value);
-            }
-            let render = options.render()?;
-            let stage = stage.changed(scene, &SceneChanges { width, height, ..render::changes(&render) })?;
-            let orders = match render.order {
-                ScatteringOrders::All => None,
-                ScatteringOrders::UpTo(orders) => Some(orders),
-            };
-            all.push(Setting { scene: scene.clone(), axes: axes.clone(), stage, orders });
-        }
-    }
-    Ok(all)
-}
-
-/// Width and height: what is given, the other in proportion; else the scene's, but no more than [`PIXELS`] in all.
-fn size(scene: &Scene, width: Option<u32>, height: Option<u32>) -> [u32; 2] {
-    let (w, h) = (f64::from(scene.width), f64::from(scene.height));
-    let scaled = |length: f64, by: f64| (length * by).round().clamp(1.0, 65536.0) as u32;
-    match (width, height) {
-        (Some(width), Some(height)) => [width, height],
-        (Some(width), None) => [width, scaled(h, f64::from(width) / w)],
-        (None, Some(height)) => [scaled(w, f64::from(height) / h), height],
-        (None, None) => [w, h].map(|length| scaled(length, (PIXELS / (w * h)).sqrt().min(1.0))),
-    }
-}
-
 /// Pools of threads by their size; 0 is one thread for each core.
 #[derive(Default)]
 struct Pools(BTreeMap<usize, ThreadPool>);
 
 impl Pools {
     fn get(&mut self, threads: usize) -> Result<&ThreadPool, Failure> {
-        if !self.0.contains_key(&threads) {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
-            self.0.insert(threads, pool.map_err(|e| Failure::work(format!("--threads: {e}")))?);
+        match self.0.entry(threads) {
+            Entry::Occupied(pool) => Ok(pool.into_mut()),
+            Entry::Vacant(place) => {
+                let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
+                Ok(place.insert(pool.map_err(|e| Failure::work(format!("--threads: {e}")))?))
+            }
         }
-        self.0.get(&threads).ok_or_else(|| Failure::work("no threads"))
     }
 }
 
@@ -184,16 +129,17 @@ impl Sweep<'_> {
         bakes.sort();
         bakes.dedup();
         let groups = (settings.len() * self.source.frames().len()) as u64;
-        let steps = LONG * bakes.len() as u64 + groups * (LONG + self.points.len() as u64);
+        let point = u64::from(self.args.repeat);
+        let steps = BAKE_STEPS * bakes.len() as u64 + groups * (REFERENCE_STEPS + point * self.points.len() as u64);
         let progress = Progress::start(self.args.progress, "sweeping", steps);
         let mut packs = BTreeMap::new();
         for bake in bakes {
-            progress.describe(format!("baking {}", words(&bake)));
+            progress.describe(format!("baking {}", words(&bake)).trim_end().to_owned());
             let threads = self.args.threads.unwrap_or(0);
             let (source, store) = (&self.source, &self.store);
             let pack = self.pools.get(threads)?.install(|| source.pack(&bake, store))?;
             packs.insert(bake, pack);
-            progress.advance(LONG);
+            progress.advance(BAKE_STEPS);
         }
         let mut all = Vec::new();
         for setting in settings {
@@ -219,7 +165,7 @@ impl Sweep<'_> {
             frame: self.source.frames()[i],
         };
         let (key, image, reference) = self.reference(setting, i, progress)?;
-        progress.advance(LONG);
+        progress.advance(REFERENCE_STEPS);
         let (mut rows, mut refused) = (Vec::new(), Vec::new());
         for index in 0..self.points.len() {
             let point = self.points[index].clone();
@@ -243,7 +189,7 @@ impl Sweep<'_> {
                     refused.push([point.dial, point.value, why]);
                 }
             }
-            progress.advance(1);
+            progress.advance(self.args.repeat.into());
         }
         let size = [image.width, image.radiance.len() / image.width];
         Ok(Group { place, size, reference, picture: key, full_colour: FULL_COLOUR, rows, refused })
@@ -256,10 +202,8 @@ impl Sweep<'_> {
         progress: &Progress,
     ) -> Result<(Key, ReferenceImage, ReferenceFigures), Failure> {
         let target = self.args.reference_error;
-        let scene = serde_json::to_string(&setting.stage.scene).map_err(|e| Failure::work(e.to_string()))?;
-        let images = image_hashes(&setting.stage.scene)?;
-        let asked = format!("{:?} {target}", setting.orders);
-        let key = Key::of(&["reference", &self.source.identity(i), &scene, &images, &asked]);
+        let (density, scene) = (self.source.identity(i), setting.identity()?);
+        let key = Key::of(&["reference", &density, &scene, &target.to_string()]);
         if let Some(figures) = self.store.find(&key) {
             return Ok((key.clone(), self.store.read_reference(&key)?, figures));
         }
@@ -285,21 +229,26 @@ impl Sweep<'_> {
         point: &Point,
         (reference, truth): (&Key, &ReferenceImage),
     ) -> Result<(Key, Outcome), Failure> {
-        let render: RenderArgs = point.options.render()?;
+        let render: RenderArgs = setting.options(&point.options).render()?;
         // The Debug form has every option: whatever is not the same in it is another point.
         let (made_by, repeat) = (format!("{render:?}"), self.args.repeat.to_string());
         let key = Key::of(&["point", reference.as_str(), &format!("{:016x}", pack.checksum()), &made_by, &repeat]);
         if let Some(outcome) = self.store.find(&key) {
             return Ok((key, outcome));
         }
-        let (method, repeat) = (Method::choose(&render, &setting.stage)?, self.args.repeat);
-        let position = self.source.position(i);
+        let (position, repeat) = (self.source.position(i), self.args.repeat);
         let pool = self.pools.get(render.threads.unwrap_or(0))?;
-        let rendered = pool.install(|| measure::render(pack, position, &method, &setting.stage, repeat))?;
         let threads = pool.current_num_threads();
+        let rendered = match Method::choose(&render, &setting.stage).map_err(points::conflict) {
+            Ok(method) => pool
+                .install(|| measure::render(pack, position, &method, &setting.stage, repeat))?
+                .map(|rendered| (method, rendered)),
+            // Its options do not go with the order of this scene.
+            Err(failure) => Err(failure?.to_string().trim_start_matches("error: ").trim().to_owned()),
+        };
         let outcome = match rendered {
             Err(why) => Outcome::Refused(why),
-            Ok((film, seconds)) => {
+            Ok((method, (film, seconds))) => {
                 let radiance: Vec<[f32; 3]> = film.pixels.iter().map(|p| p.radiance).collect();
                 let alpha: Vec<f32> = film.pixels.iter().map(|p| p.alpha()).collect();
                 match truth.distance(&radiance, &alpha) {
@@ -356,37 +305,4 @@ impl Sweep<'_> {
 /// Options as text: `gaussians=100 max-error=0.01`.
 fn words(options: &Options) -> String {
     options.iter().map(|(name, value)| format!("{name}={value}")).collect::<Vec<_>>().join(" ")
-}
-
-/// The contents of the images that a scene names.
-fn image_hashes(scene: &Scene) -> Result<String, Failure> {
-    let mut text = String::new();
-    for light in &scene.lights {
-        if let Light::Environment { sky: Sky::Image { resolved, .. }, .. } = light {
-            text += &format!("{:032x} ", u128::from_le_bytes(hash_file(resolved)?));
-        }
-    }
-    Ok(text)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn an_image_has_about_twenty_thousand_pixels_in_the_scenes_shape_and_is_never_enlarged() {
-        let path = std::path::Path::new("a.toml");
-        let text = "[camera]\nposition = [0, 0, 0]\ntarget = [1, 0, 0]\nfov = 30\n[image]\nwidth = W\nheight = H\n\
-                    [medium]\nsigma_t = 1\n";
-        let scene = |w: u32, h: u32| {
-            let text = text.replace('W', &w.to_string()).replace('H', &h.to_string());
-            Scene::parse(path, &text).unwrap()
-        };
-        assert_eq!(size(&scene(300, 400), None, None), [122, 163]);
-        assert_eq!(size(&scene(30, 40), None, None), [30, 40]);
-        assert_eq!(size(&scene(65536, 1), None, None), [36204, 1]);
-        assert_eq!(size(&scene(300, 400), Some(60), None), [60, 80]);
-        assert_eq!(size(&scene(300, 400), None, Some(40)), [30, 40]);
-        assert_eq!(size(&scene(300, 400), Some(7), Some(9)), [7, 9]);
-    }
 }

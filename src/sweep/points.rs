@@ -77,7 +77,7 @@ fn star(base: &Options, dials: &[Assignment], stage: &Stage) -> Result<Vec<Point
                         middles.push(other);
                     }
                 }
-                (None, Some(failure)) => return Err(failure),
+                (None, Some(conflict)) => return Err(conflict.into()),
                 (None, None) => {}
             }
         }
@@ -107,7 +107,7 @@ fn combine(base: &Options, dials: &[Assignment], stage: &Stage) -> Result<Vec<Po
         }
     }
     match (points.is_empty(), refused) {
-        (true, Some(failure)) => Err(failure),
+        (true, Some(conflict)) => Err(conflict.into()),
         _ => Ok(points),
     }
 }
@@ -118,10 +118,10 @@ fn check(options: &Options, stage: &Stage) -> Result<(), Failure> {
     options.bake("volumes".as_ref(), "pack".as_ref(), "1", false).map(|_| ())
 }
 
-/// The failure, if it only says that two options do not go together; else it ends the sweep.
-fn conflict(failure: Failure) -> Result<Failure, Failure> {
+/// What the parser says, if it is only that two options do not go together; else the failure, which ends the sweep.
+pub fn conflict(failure: Failure) -> Result<clap::Error, Failure> {
     match failure {
-        Failure::Usage(e) if e.kind() == ErrorKind::ArgumentConflict => Ok(Failure::Usage(e)),
+        Failure::Usage(e) if e.kind() == ErrorKind::ArgumentConflict => Ok(e),
         other => Err(other),
     }
 }
@@ -147,9 +147,11 @@ pub fn usual(density_max: Option<f32>) -> Vec<Assignment> {
     ];
     if let Some(peak) = density_max {
         // The default promise is the peak over 510.
-        let part = |by: f32| if peak > 0.0 { peak / by } else { 1.0 / by };
+        let peak = if peak > 0.0 { peak } else { 1.0 };
+        // Two digits, as a person would write it.
+        let part = |by: f32| format!("{:.1e}", peak / by).parse::<f32>().unwrap_or(peak);
         dials.push(("gaussians", "100,300".into()));
-        dials.push(("max-error", format!("{},{},{}", part(2000.0), part(100.0), part(25.0))));
+        dials.push(("max-error", format!("{},{},{}", part(2000.0), part(100.0), part(30.0))));
     }
     // A dial that this program does not have (yet) has no arm.
     let known = dials.into_iter().filter(|(name, _)| options::owner(name).is_some());
@@ -287,7 +289,7 @@ mod tests {
         let all = usual(Some(0.5));
         assert!(check_names("--dial", &render_only, Some("a.smoke".as_ref())).is_ok());
         assert_eq!(all.len(), render_only.len() + 2);
-        assert_eq!(all.last().unwrap().values[2], "0.02");
+        assert_eq!(all.last().unwrap().values, ["0.00025", "0.005", "0.017"]);
         let points = expand(&Options::default(), &all, false, &stage()).unwrap();
         for dial in &all {
             assert!(dial.name == "route" || points.iter().any(|p| p.dial == dial.name), "{}", dial.name);
