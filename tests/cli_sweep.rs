@@ -136,10 +136,17 @@ fn what_cannot_be_swept_is_refused_before_anything_is_written() {
         assert!(output.status.code() == Some(2) && message.contains(named), "{more:?}: {message}");
     }
     assert!(!folder.join("nothing").exists());
+    let point = "\n[[light]]\nkind = \"point\"\nposition = [0, 0, 1]\nintensity = 10\n";
+    std::fs::write(folder.join("point.toml"), SCENE.to_owned() + point).unwrap();
+    let line = ["sweep", "plume.smoke", "--scene", "point.toml", "-o", "point", "--dial", "sh-order=2", "--width", "8"];
+    let output = smoke_bake(folder, &[&line[..], &["--reference-error", "50%", "--progress", "none"]].concat());
+    let message = text(&output.stderr);
+    assert!(output.status.code() == Some(1) && message.contains("nothing could be measured"), "{message}");
+    assert!(message.contains("sh-order 2: left out") && !folder.join("point/sweep.csv").exists());
     std::fs::create_dir(folder.join("strange")).unwrap();
     std::fs::write(folder.join("strange/index.html"), "the user's").unwrap();
     for more in [&[][..], &["--resume"]] {
-        assert!(refusal(folder, &line("plume.smoke", "strange", more)).contains("other files"));
+        assert!(refusal(folder, &self::line("plume.smoke", "strange", more)).contains("other files"));
     }
     assert_eq!(std::fs::read_to_string(folder.join("strange/index.html")).unwrap(), "the user's");
 }

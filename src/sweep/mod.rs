@@ -67,6 +67,10 @@ pub fn run(args: &SweepArgs) -> Result<(), Failure> {
     let store = Store::open(&args.output, args.resume)?;
     let mut sweep = Sweep { args, source, points, store, pools: Pools::default() };
     let groups = sweep.measure(&settings)?;
+    if groups.iter().all(|g| g.rows.is_empty()) {
+        let why = groups.iter().flat_map(|g| &g.refused).next().map_or("no points", |[_, _, why]| why);
+        return Err(Failure::work(format!("{}: nothing could be measured: {why}", args.input.display())));
+    }
     let names: Vec<Value> = dials.iter().map(|d| json!({ "name": d.name, "values": d.values })).collect();
     let asked = json!({
         "input": args.input, "scenes": args.scene, "frames": sweep.source.frames(), "dials": names, "grid": args.grid,
@@ -134,7 +138,9 @@ impl Sweep<'_> {
         let progress = Progress::start(self.args.progress, "sweeping", steps);
         let mut packs = BTreeMap::new();
         for bake in bakes {
-            progress.describe(format!("baking {}", words(&bake)).trim_end().to_owned());
+            if matches!(self.source, Source::Volumes { .. }) {
+                progress.describe(format!("baking {}", words(&bake)).trim_end().to_owned());
+            }
             let threads = self.args.threads.unwrap_or(0);
             let (source, store) = (&self.source, &self.store);
             let pack = self.pools.get(threads)?.install(|| source.pack(&bake, store))?;
