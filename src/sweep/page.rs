@@ -195,12 +195,12 @@ fn rows(out: &mut String, group: &Group, charts: &Charts) {
         let times: String = stages
             .iter()
             .map(|&name| f.seconds.stages.get(name).and_then(|v| v.as_f64()))
-            .map(|v| format!("<td>{}</td>", v.map_or(String::new(), |v| format!("{v:.4}"))))
+            .map(|v| format!("<td>{}</td>", v.map_or(String::new(), |v| format!("{v:.3}"))))
             .collect();
         let _ = writeln!(
             out,
             "<tr{}><td class=\"text\">{}</td><td class=\"text\">{}</td><td class=\"text\">{}</td><td>{}</td><td>{}</td>\
-             <td>{:+.3} %</td>{times}<td>{:.4}</td><td>{}</td><td>{:.2}</td></tr>",
+             <td>{:+.3} %</td>{times}<td>{:.3}</td><td>{}</td><td>{:.2}</td></tr>",
             if best { " class=\"best\"" } else { "" },
             escape(&f.method),
             escape(&row.dial),

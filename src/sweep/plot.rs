@@ -8,8 +8,9 @@ use std::fmt::Write;
 
 /// Room around the plotting area: left, right, top, bottom, in pixels.
 const MARGIN: [f64; 4] = [62.0, 14.0, 12.0, 44.0];
-/// Colours there are, `--c0` and on in the page's style; curves beyond them begin anew with another marker.
-pub const COLOURS: usize = 10;
+/// Colours there are after that of the defaults: `--c1` and on in the page's style; curves beyond them begin anew with
+/// another marker.
+const COLOURS: usize = 9;
 /// Markers there are.
 const MARKERS: usize = 7;
 /// Half the size of a marker.
@@ -94,7 +95,7 @@ pub struct Mark {
 /// How a curve is drawn.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Style {
-    /// Which colour and marker; none for the path tracer's dashed line.
+    /// Which colour and marker, 0 for the defaults alone; none for the path tracer's dashed line.
     pub number: Option<usize>,
     /// Markers that are open instead of full, and a thinner line.
     pub open: bool,
@@ -143,8 +144,10 @@ impl Plot {
             "<svg viewBox=\"0 0 {width} {height}\" width=\"{width}\" height=\"{height}\" role=\"img\" aria-label=\"{}\">\n",
             escape(&self.title)
         );
-        let (across, up) = (width - left - right, height - top - bottom);
-        self.grid(&mut out, [across, up]);
+        let across = width - left - right;
+        let slope = self.slope(across);
+        let up = height - top - bottom - slope;
+        self.grid(&mut out, [across, up], slope);
         let at = |x: f64, y: f64| [left + across * self.x.place(x), top + up * (1.0 - self.y.place(y))];
         if let Some(first) = self.front.first() {
             // From the top: nothing faster than the first is as good as anything on the front.
@@ -166,18 +169,21 @@ impl Plot {
         out + "</svg>"
     }
 
-    /// Frame, grid lines, ticks and labels around an area of `size`.
-    fn grid(&self, out: &mut String, [across, up]: [f64; 2]) {
-        let [left, _, top, _] = MARGIN;
-        let _ = writeln!(out, "<rect class=\"area\" x=\"{left}\" y=\"{top}\" width=\"{across}\" height=\"{up}\"/>");
+    /// Room below for the names across: names that would touch lie aslant, at 24 degrees; 0 where they have room.
+    fn slope(&self, across: f64) -> f64 {
         let ticks = self.x.ticks((across / 55.0) as usize);
-        // Names that would touch lie aslant.
-        let longest = ticks.iter().map(|t| t.1.chars().count()).max().unwrap_or(0);
-        let aslant = longest as f64 * LETTER > across / ticks.len().max(1) as f64;
-        for (value, text) in ticks {
+        let longest = LETTER * ticks.iter().map(|t| t.1.chars().count()).max().unwrap_or(0) as f64;
+        if longest > across / ticks.len().max(1) as f64 { longest * 24f64.to_radians().sin() } else { 0.0 }
+    }
+
+    /// Frame, grid lines, ticks and labels around an area of `size`, with names of that `slope`.
+    fn grid(&self, out: &mut String, [across, up]: [f64; 2], slope: f64) {
+        let [left, _, top, bottom] = MARGIN;
+        let _ = writeln!(out, "<rect class=\"area\" x=\"{left}\" y=\"{top}\" width=\"{across}\" height=\"{up}\"/>");
+        for (value, text) in self.x.ticks((across / 55.0) as usize) {
             let x = left + across * self.x.place(value);
             let y = top + up;
-            let (turn, anchor) = if aslant {
+            let (turn, anchor) = if slope > 0.0 {
                 (format!(" transform=\"rotate(-24 {x:.1} {:.1})\"", y + 13.0), "end")
             } else {
                 (String::new(), "middle")
@@ -195,7 +201,7 @@ impl Plot {
                 writeln!(out, "<text x=\"{:.1}\" y=\"{:.1}\" text-anchor=\"end\">{text}</text>", left - 6.0, y + 4.0);
         }
         let (x, y) = (left + across / 2.0, top + up / 2.0);
-        let below = top + up + MARGIN[3] - 8.0;
+        let below = top + up + bottom + slope - 8.0;
         let _ = writeln!(
             out,
             "<text class=\"label\" x=\"{x:.1}\" y=\"{below:.1}\" text-anchor=\"middle\">{}</text>",
@@ -242,7 +248,11 @@ impl Curve {
 
 impl Style {
     fn class(self) -> String {
-        let colour = self.number.map_or("tracer".to_owned(), |n| format!("c{}", n % COLOURS));
+        let colour = match self.number {
+            None => "tracer".to_owned(),
+            Some(0) => "c0".to_owned(),
+            Some(n) => format!("c{}", 1 + (n - 1) % COLOURS),
+        };
         if self.open { colour + " open" } else { colour }
     }
 
@@ -254,7 +264,7 @@ impl Style {
             format!("<polygon class=\"marker\" points=\"{}\"/>", corners.join(" "))
         };
         // Another marker for the second round of colours.
-        match self.number.map(|n| (n + n / COLOURS) % MARKERS) {
+        match self.number.map(|n| (n + n.saturating_sub(1) / COLOURS) % MARKERS) {
             None => format!("<circle class=\"marker\" cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"2.6\"/>"),
             Some(0) => format!("<circle class=\"marker\" cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"{r}\"/>"),
             Some(1) => polygon(&[[-0.9, -0.9], [0.9, -0.9], [0.9, 0.9], [-0.9, 0.9]]),
@@ -379,6 +389,22 @@ mod tests {
         };
         let svg = plot.svg() + &curve.legend();
         assert!(!svg.contains("<b ") && !svg.contains('\u{7}') && svg.matches("&lt;b a=").count() >= 8, "{svg}");
+    }
+
+    #[test]
+    fn names_lie_aslant_where_they_have_no_room() {
+        let plot = |name: &str| Plot {
+            title: String::new(),
+            size: [MARGIN[0] + MARGIN[1] + 200.0, 200.0],
+            x_label: String::new(),
+            y_label: String::new(),
+            x: Scale::Names(vec![name.into(); 4]),
+            y: Scale::Log(1.0, 10.0),
+            curves: vec![],
+            front: vec![],
+        };
+        assert!(plot("0.25").slope(200.0) == 0.0 && !plot("0.25").svg().contains("rotate(-24"));
+        assert!(plot("pointwise").slope(200.0) > 10.0 && plot("pointwise").svg().contains("rotate(-24"));
     }
 
     #[test]
