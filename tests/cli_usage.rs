@@ -49,6 +49,8 @@ fn wrong_usage_goes_to_stderr_with_exit_code_2() {
         (&["compare", "a.exr", "a.exr", "--jsn"], "'--json'"),
         (&["compare", "a.exr", "a.exr", "-o", "d.jpg"], "expected a name that ends in .png or .exr"),
         (&["compare", "a.exr", "a.exr", "--scale", "0"], "expected a finite number above zero"),
+        (&["compare", "a.exr", "a.exr", "--passes", "1"], "expected a whole number of at least 2"),
+        (&["compare", "a.exr", "a.exr", "--pixels-per-degree", "0"], "expected a number from 1 to 1000"),
     ] {
         let output = smoke_bake(folder.path(), line, &[]);
         assert_eq!((output.status.code(), text(&output.stdout)), (Some(2), ""), "{line:?}");

@@ -3,13 +3,14 @@
 
 pub mod backdrop;
 pub mod camera;
+pub mod error_function;
 pub mod film;
 pub mod image_difference;
 pub mod lanes;
 pub mod light;
 pub mod march;
 pub mod medium;
-pub mod noisy_reference;
 pub mod renderer;
 pub mod sphere;
+pub mod statistics;
 pub mod transport;

@@ -70,12 +70,12 @@ impl Environment {
         // One turn more than none, so that the cast of -1 cannot happen.
         let column = |step: usize| ((x + self.width as f64).floor() as usize + step) % self.width;
         let row = |step: f64| ((y.floor() + step).max(0.0) as usize).min(self.height - 1);
-        let texel = |i: usize, j: f64| self.radiance[row(j) * self.width + column(i)];
+        let (left, right) = (column(0), column(1));
+        let (above, below) = (row(0.0) * self.width, row(1.0) * self.width);
+        let (a, b) = (&self.radiance[above + left], &self.radiance[above + right]);
+        let (c, d) = (&self.radiance[below + left], &self.radiance[below + right]);
         let mix = |a: f32, b: f32, f: f32| a * (1.0 - f) + b * f;
-        std::array::from_fn(|c| {
-            let line = |j: f64| mix(texel(0, j)[c], texel(1, j)[c], f);
-            mix(line(0.0), line(1.0), g)
-        })
+        [0, 1, 2].map(|k| mix(mix(a[k], b[k], f), mix(c[k], d[k], f), g))
     }
 
     /// Mean radiance over each of `count` cells of a partition of the sphere, of which `cell` tells the one of a unit

@@ -9,7 +9,7 @@ mod render;
 mod sweep;
 
 pub use bake::{AtRest, BakeArgs, GaussianCount, ResidualAddress, TeleportRule};
-pub use compare::CompareArgs;
+pub use compare::{CompareArgs, Picture};
 pub use render::{ExponentialChoice, MethodChoice, MultipleChoice, RenderArgs, RouteChoice, ScatteringOrders};
 pub use sweep::{Assignment, SweepArgs};
 
@@ -45,7 +45,7 @@ pub enum Command {
     Validate(ValidateArgs),
     /// Decode a pack's frames to OpenVDB or Mitsuba volumes.
     Unpack(UnpackArgs),
-    /// Measure how far an image is from a reference: RMSE, PSNR, bias, largest error.
+    /// Measure how far an image is from a reference: RMSE, bias, FLIP, and a test against its noise.
     Compare(CompareArgs),
     /// Measure what every dial costs and buys, against a reference: tables and a page of plots.
     Sweep(SweepArgs),

@@ -9,10 +9,12 @@ use crate::staging::Stage;
 use smoke_formats::image::RgbImage;
 use smoke_formats::pack::Pack;
 use smoke_runtime::film::Film;
-use smoke_runtime::image_difference::{self, Pair};
+use smoke_runtime::image_difference::debiased::debiased;
+use smoke_runtime::image_difference::flip::flip;
+use smoke_runtime::image_difference::uncertainty::uncertainty;
+use smoke_runtime::image_difference::{self, Incomparable, Noise, Pair, false_colour};
 use smoke_runtime::medium::field::DensityField;
 use smoke_runtime::medium::frame::Frame;
-use smoke_runtime::noisy_reference::{Distance, distance};
 use smoke_runtime::transport::reference::{ReferenceSettings, trace};
 use std::time::Instant;
 
@@ -20,6 +22,8 @@ use std::time::Instant;
 pub const FULL_COLOUR: f64 = 0.1;
 /// Widest thumbnail, in pixels.
 const WIDEST: usize = 160;
+/// How close FLIP looks: a screen of 3840 pixels, 70 cm wide, from 70 cm; what `compare` has by default.
+const PIXELS_PER_DEGREE: f64 = 67.0;
 /// Seed of the references: not one that `render` has by default, or a sweep of its own reference would meet itself.
 const SEED: u64 = 0x7377_6565_7001;
 
@@ -60,8 +64,7 @@ pub fn reference(
         alpha: estimate.film.pixels.iter().map(|p| p.alpha()).collect(),
     };
     // The tracer counts all pixels; a sweep those with smoke. The variance of both falls with the passes alike.
-    let own = image.radiance.clone();
-    let seen = image.distance(&own, &image.alpha).map_or(estimate.relative_error, |d| d.noise);
+    let seen = image.noise().unwrap_or(estimate.relative_error);
     let scale = if estimate.relative_error > 0.0 { seen / estimate.relative_error } else { 1.0 };
     curve.iter_mut().for_each(|at| at.relative_standard_error *= scale);
     Ok((image, ReferenceFigures { passes: estimate.passes, seconds, relative_standard_error: seen, curve }))
@@ -95,12 +98,36 @@ pub fn render(
     Ok(Ok((film, seconds)))
 }
 
+/// How far an image is from a reference; standard errors are those that the reference's noise leaves.
+pub struct Distance {
+    /// Relative RMSE without the reference's noise, and its standard error.
+    pub relative_rmse: [f64; 2],
+    /// Mean error over the mean of the reference, and its standard error.
+    pub bias: [f64; 2],
+    /// Mean FLIP.
+    pub flip: f64,
+}
+
 impl ReferenceImage {
     /// How far `radiance` with opacities `alpha` is from this reference, over the pixels where either sees smoke.
-    pub fn distance(&self, radiance: &[[f32; 3]], alpha: &[f32]) -> Result<Distance, image_difference::Incomparable> {
+    pub fn distance(&self, radiance: &[[f32; 3]], alpha: &[f32]) -> Result<Distance, Incomparable> {
         let mask = image_difference::seen(alpha, Some(&self.alpha));
         let pair = Pair { width: self.width, test: radiance, reference: &self.radiance, mask: Some(&mask) };
-        distance(&pair, &self.standard_error)
+        let noise = Noise { standard_error: &self.standard_error, passes: None };
+        let (figures, sure) = (debiased(&pair, &noise)?.all, uncertainty(&pair, &noise)?);
+        Ok(Distance {
+            relative_rmse: [figures.relative_rmse, sure.relative_rmse],
+            bias: [image_difference::compare(&pair)?.all.bias, sure.bias],
+            flip: flip(&pair, PIXELS_PER_DEGREE)?.figures.mean,
+        })
+    }
+
+    /// Relative standard error of this reference over the pixels where it sees smoke; none if there are none.
+    fn noise(&self) -> Option<f64> {
+        let mask = image_difference::seen(&self.alpha, None);
+        let pair = Pair { width: self.width, test: &self.radiance, reference: &self.radiance, mask: Some(&mask) };
+        let noise = Noise { standard_error: &self.standard_error, passes: None };
+        debiased(&pair, &noise).ok().map(|d| d.all.reference_noise)
     }
 
     /// The reference as a thumbnail.
@@ -127,7 +154,7 @@ impl ReferenceImage {
             samples.fold((0.0, 0.0), |(sum, count), &v| (sum + f64::from(v) * f64::from(v), count + 1.0));
         let scale = FULL_COLOUR * (sum / f64::max(count, 1.0)).sqrt();
         let pair = Pair { width: self.width, test: radiance, reference: &self.radiance, mask: Some(&mask) };
-        let pixels = image_difference::false_colour(&pair, if scale > 0.0 { scale } else { 1.0 });
+        let pixels = false_colour::signed(&pair, if scale > 0.0 { scale } else { 1.0 });
         let pixels = pixels.map_err(|e| Failure::work(e.to_string()))?;
         let image = RgbImage { width: self.width, height: pixels.len() / self.width, pixels };
         Ok(contact_sheet::thumbnail(&image, self.thumbnail_size(), 1.0))

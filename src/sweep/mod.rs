@@ -259,7 +259,7 @@ impl Sweep<'_> {
                 let alpha: Vec<f32> = film.pixels.iter().map(|p| p.alpha()).collect();
                 match truth.distance(&radiance, &alpha) {
                     Err(e) => Outcome::Refused(e.to_string()),
-                    Ok(d) if !(d.relative_rmse.is_finite() && d.bias.is_finite() && d.bias_error.is_finite()) => {
+                    Ok(d) if !d.relative_rmse.iter().chain(&d.bias).all(|v| v.is_finite()) => {
                         Outcome::Refused("the reference is black, and the image is not".into())
                     }
                     Ok(d) => {
@@ -273,10 +273,11 @@ impl Sweep<'_> {
                         let at_rest: u64 = pack.frames().iter().map(|f| f.bytes_at_rest).sum();
                         let active: u64 = pack.frames().iter().map(|f| f.active_voxels).sum();
                         Outcome::Measured(Box::new(Figures {
-                            relative_rmse: d.relative_rmse,
-                            relative_rmse_standard_error: d.relative_rmse_error,
-                            bias: d.bias,
-                            bias_standard_error: d.bias_error,
+                            relative_rmse: d.relative_rmse[0],
+                            relative_rmse_standard_error: d.relative_rmse[1],
+                            bias: d.bias[0],
+                            bias_standard_error: d.bias[1],
+                            flip: d.flip,
                             seconds,
                             pack_bytes: pack.file_bytes(),
                             bits_per_active_voxel: 8.0 * at_rest as f64 / active.max(1) as f64,

@@ -185,7 +185,7 @@ fn rows(out: &mut String, group: &Group, charts: &Charts) {
     let _ = write!(
         out,
         "<h3>All rows</h3>\n<p>Marked: on the Pareto front.</p>\n<div class=\"scroll\"><table>\n<tr><th class=\"text\">method\
-         </th><th class=\"text\">dial</th><th class=\"text\">value</th><th>error</th><th>\u{b1}</th><th>bias</th>{heads}<th>\
+         </th><th class=\"text\">dial</th><th class=\"text\">value</th><th>error</th><th>\u{b1}</th><th>bias</th><th>FLIP</th>{heads}<th>\
          total, s</th><th>pack, bytes</th><th>bits a voxel</th></tr>\n"
     );
     let front = charts.front(group);
@@ -200,7 +200,7 @@ fn rows(out: &mut String, group: &Group, charts: &Charts) {
         let _ = writeln!(
             out,
             "<tr{}><td class=\"text\">{}</td><td class=\"text\">{}</td><td class=\"text\">{}</td><td>{}</td><td>{}</td>\
-             <td>{:+.3} %</td>{times}<td>{:.3}</td><td>{}</td><td>{:.2}</td></tr>",
+             <td>{:+.3} %</td><td>{:.4}</td>{times}<td>{:.3}</td><td>{}</td><td>{:.2}</td></tr>",
             if best { " class=\"best\"" } else { "" },
             escape(&f.method),
             escape(&row.dial),
@@ -208,6 +208,7 @@ fn rows(out: &mut String, group: &Group, charts: &Charts) {
             percent(f.relative_rmse),
             percent(f.relative_rmse_standard_error),
             100.0 * f.bias,
+            f.flip,
             f.seconds.total,
             f.pack_bytes,
             f.bits_per_active_voxel

@@ -4,7 +4,7 @@
 //! |---|---|
 //! | `sweep.csv`, `sweep.json`, `index.html` | the answer, each whole |
 //! | `journal.jsonl` | a line for each finished measurement: the [`Key`] of what made it, and what was measured |
-//! | `references/KEY.exr` | a reference: R, G, B, A, and their standard errors `error.R`, `error.G`, `error.B` |
+//! | `references/KEY.exr` | a reference: R, G, B, A, and `standard_error.R`, `.G`, `.B`, as `compare` takes it |
 //! | `pictures/KEY.png`, `KEY.difference.png` | thumbnails |
 //! | `packs/KEY.smoke` | packs of bake dials |
 //!
@@ -34,7 +34,7 @@ const FOLDERS: [&str; 3] = ["references", "pictures", "packs"];
 /// Answers of a sweep.
 const ANSWERS: [&str; 3] = ["sweep.csv", "sweep.json", "index.html"];
 /// Channels of a reference.
-const CHANNELS: [&str; 7] = ["R", "G", "B", "A", "error.R", "error.G", "error.B"];
+const CHANNELS: [&str; 7] = ["R", "G", "B", "A", "standard_error.R", "standard_error.G", "standard_error.B"];
 
 /// The name of a result: 32 hexadecimal digits from everything that it depends on.
 #[derive(Clone, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]

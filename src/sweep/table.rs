@@ -38,6 +38,8 @@ pub struct Figures {
     pub bias: f64,
     /// Its standard error.
     pub bias_standard_error: f64,
+    /// Mean FLIP, 0 to 1, the reference's noise included.
+    pub flip: f64,
     /// Seconds.
     pub seconds: Seconds,
     /// Bytes of the pack's file.
@@ -135,7 +137,7 @@ pub fn csv(groups: &[Group]) -> String {
     let mut head = names(&["scene"]);
     head.extend(axes);
     head.extend(names(&["frame", "method", "dial", "value"]));
-    head.extend(names(&["relative_rmse", "relative_rmse_standard_error", "bias", "bias_standard_error"]));
+    head.extend(names(&["relative_rmse", "relative_rmse_standard_error", "bias", "bias_standard_error", "flip"]));
     head.extend(stages.iter().map(|stage| format!("{stage}_seconds")));
     head.extend(names(&["total_seconds", "pack_bytes", "bits_per_active_voxel", "bake", "settings"]));
     let mut out = record(head);
@@ -144,7 +146,7 @@ pub fn csv(groups: &[Group]) -> String {
         let mut fields = vec![place.scene.clone()];
         fields.extend(place.axes.iter().map(|(_, value)| value.clone()));
         fields.extend([place.frame.to_string(), f.method.clone(), row.dial.clone(), row.value.clone()]);
-        let errors = [f.relative_rmse, f.relative_rmse_standard_error, f.bias, f.bias_standard_error];
+        let errors = [f.relative_rmse, f.relative_rmse_standard_error, f.bias, f.bias_standard_error, f.flip];
         fields.extend(errors.map(|v| v.to_string()));
         // A stage that this method does not have is empty, not zero.
         fields.extend(stages.iter().map(|&stage| f.seconds.stages.get(stage).map_or(String::new(), Value::to_string)));
@@ -219,6 +221,7 @@ pub mod tests {
                 relative_rmse_standard_error: 0.001,
                 bias: -0.5 * error,
                 bias_standard_error: 0.0005,
+                flip: 0.03,
                 seconds: Seconds::new([("decode", 0.25 * total), ("view_pass", 0.75 * total)].into_iter()),
                 pack_bytes: 1000,
                 bits_per_active_voxel: 4.5,

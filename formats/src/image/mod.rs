@@ -35,6 +35,9 @@ pub const MAX_SAMPLES: u64 = 1 << 29;
 /// Longest image file that is read: twice the largest image without compression.
 const MAX_FILE_BYTES: u64 = 2 * 4 * MAX_SAMPLES;
 
+/// The first bytes of an OpenEXR file.
+const EXR_MAGIC: [u8; 4] = [0x76, 0x2f, 0x31, 0x01];
+
 /// One channel of a [`FloatImage`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct Channel {
@@ -93,7 +96,7 @@ pub fn read(path: &Path) -> Result<FloatImage> {
     // The first bytes first: what is no image is not read to its end, which a device may not have.
     file.by_ref().take(4).read_to_end(&mut bytes).map_err(io)?;
     let decode = match bytes.as_slice() {
-        [0x76, 0x2f, 0x31, 0x01] => read_exr::decode,
+        start if start == EXR_MAGIC => read_exr::decode,
         [b'#', b'?', ..] => read_hdr::decode,
         start => {
             let start: Vec<_> = start.iter().map(|b| format!("{b:02x}")).collect();
@@ -106,6 +109,19 @@ pub fn read(path: &Path) -> Result<FloatImage> {
         return Err(Error::invalid(path, "file size", "more", format!("at most {MAX_FILE_BYTES} bytes")));
     }
     decode(path, &bytes)
+}
+
+/// The settings that made an image of ours, JSON as [`FrameMetadata::settings_json`]; none if the file has none, or is not
+/// OpenEXR. Only the header is read.
+pub fn read_settings(path: &Path) -> Result<Option<String>> {
+    let io = |e| Error::io(path, e);
+    let mut file = File::open(path).map_err(io)?;
+    let mut start = Vec::new();
+    file.by_ref().take(4).read_to_end(&mut start).map_err(io)?;
+    if start != EXR_MAGIC {
+        return Ok(None);
+    }
+    read_exr::text_attribute(path, start.as_slice().chain(file), SETTINGS_ATTRIBUTE)
 }
 
 /// Reads an environment map: finite linear radiance, at least 0. Also returns how many samples were negative: colours

@@ -12,10 +12,14 @@ use exr::compression::Compression;
 use exr::image::read::image::ReadLayers;
 use exr::image::read::layers::ReadChannels;
 use exr::image::read::read;
+use exr::meta::attribute::{AttributeValue, Text};
 use exr::meta::header::Header;
 use exr::meta::{BlockDescription, MetaData};
-use std::io::Cursor;
+use std::io::{BufReader, Cursor, Read};
 use std::path::Path;
+
+/// Longest header that is read for an attribute alone. The longest of ours holds a settings text of some kilobytes.
+const MAX_HEADER_BYTES: u64 = 1 << 24;
 
 /// Longest side of a tile that is accepted. Common tiles are 16 to 512; a tile's buffer is allocated from this.
 const MAX_TILE_SIDE: usize = 1 << 13;
@@ -50,6 +54,20 @@ pub(super) fn decode(path: &Path, bytes: &[u8]) -> Result<FloatImage> {
         Channel { name: channel.name.to_string(), values: place(values, data_size, start, [width, height]) }
     });
     Ok(FloatImage { width, height, channels: channels.collect() })
+}
+
+/// The text attribute `name` of the first part of a file, from its header alone; none if there is no such text.
+pub(super) fn text_attribute(path: &Path, file: impl Read, name: &str) -> Result<Option<String>> {
+    // The bound is what a hostile header can make the crate read and hold.
+    let header = BufReader::new(file.take(MAX_HEADER_BYTES));
+    let meta = MetaData::read_from_buffered(header, false).map_err(|e| damaged(path, e))?;
+    let own = meta.headers.first().map(|header| &header.own_attributes.other);
+    let shared = meta.headers.first().map(|header| &header.shared_attributes.other);
+    let value = [own, shared].into_iter().flatten().find_map(|attributes| attributes.get(&Text::from(name)));
+    Ok(value.and_then(|value| match value {
+        AttributeValue::Text(text) => Some(text.to_string()),
+        _ => None,
+    }))
 }
 
 fn damaged(path: &Path, error: exr::error::Error) -> Error {

@@ -194,7 +194,7 @@ fn check_samples(path: &Path, name: &str, values: &[f32], width: usize, good: im
 
 #[cfg(test)]
 mod tests {
-    use super::super::{projection::Pinhole, read};
+    use super::super::{projection::Pinhole, read, read_settings};
     use super::*;
 
     const RGB: [[f32; 3]; 6] = [[0.0, 0.25, 1.0], [7e4, 2.0, 3.0], [0.1, 0.2, 0.3], [0.0; 3], [1e-3; 3], [5.0; 3]];
@@ -309,8 +309,24 @@ mod tests {
         let path = folder.path().join("a.exr");
         let metadata = FrameMetadata { settings_json: json.into(), ..metadata() };
         write_frame(&path, &frame(), &metadata, SamplePrecision::Half).unwrap();
+        assert_eq!(value(&read_settings(&path).unwrap().unwrap()), value(json));
         let bad = FrameMetadata { software: "烟".into(), ..metadata };
         assert!(write_frame(&path, &frame(), &bad, SamplePrecision::Half).is_err());
+    }
+
+    #[test]
+    fn an_image_without_settings_has_none_and_a_damaged_header_is_an_error() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.exr");
+        let channels = vec![Channel { name: "Y".into(), values: vec![0.0] }];
+        write_channels(&path, &FloatImage { width: 1, height: 1, channels }).unwrap();
+        assert_eq!(read_settings(&path).unwrap(), None);
+        std::fs::write(&path, b"#?RADIANCE\n").unwrap();
+        assert_eq!(read_settings(&path).unwrap(), None);
+        write_frame(&path, &frame(), &metadata(), SamplePrecision::Half).unwrap();
+        let bytes = std::fs::read(&path).unwrap();
+        std::fs::write(&path, &bytes[..100]).unwrap();
+        assert!(read_settings(&path).unwrap_err().to_string().starts_with(&path.display().to_string()));
     }
 
     #[test]

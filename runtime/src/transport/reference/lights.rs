@@ -1,12 +1,20 @@
-//! The lights as the path tracer asks for them: one light of infinity drawn by its power, and points.
+//! The lights as the path tracer asks for them: one light of infinity drawn by its power, its direction by the guide to
+//! where light gets through ([`super::guide`]); and points.
 
+use super::guide::{self, Guide};
+use super::majorant::Majorants;
 use super::sky::Sky;
+use super::tracking::Space;
 use crate::light::Light;
+use crate::medium::field::DensityField;
 use glam::{DVec3, Vec3};
+
+/// Cells along the side of a guide's brick, as a power of two.
+const GUIDE_SHIFT: u32 = 2;
 
 /// A light of infinity.
 enum Distant {
-    Sky(Sky),
+    Sky(Box<Sky>, Guide),
     Sun { toward: Vec3, irradiance: Vec3 },
 }
 
@@ -31,8 +39,9 @@ pub struct Drawn {
 }
 
 impl Lights {
-    /// Tables for `lights`; black ones are left out.
-    pub fn new(lights: &[Light]) -> Self {
+    /// Tables for `lights` around `field` with extinction `sigma`; black ones are left out.
+    pub fn new(lights: &[Light], field: &DensityField, space: &Space, sigma: f32) -> Self {
+        let middles = Majorants::middles(field, GUIDE_SHIFT);
         let mut all = Self::default();
         let mut powers = Vec::new();
         for light in lights {
@@ -40,7 +49,8 @@ impl Lights {
                 Light::Environment(environment) => {
                     if let Some(sky) = Sky::new(environment) {
                         powers.push(sky.flux());
-                        all.distant.push(Distant::Sky(sky));
+                        let guide = Guide::new(space, &middles, &sky, sigma);
+                        all.distant.push(Distant::Sky(Box::new(sky), guide));
                     }
                 }
                 Light::Directional { toward, irradiance } => {
@@ -80,22 +90,24 @@ impl Lights {
 
     /// True if there is light that a scattered ray can run into.
     pub fn has_sky(&self) -> bool {
-        self.distant.iter().any(|d| matches!(d, Distant::Sky(_)))
+        self.distant.iter().any(|d| matches!(d, Distant::Sky(..)))
     }
 
     fn chance(&self, i: usize) -> f32 {
         self.chances[i] - if i == 0 { 0.0 } else { self.chances[i - 1] }
     }
 
-    /// Light from a direction drawn by `choice` and `u`, all in [0, 1); there must be some.
+    /// Light from a direction drawn for `at` (node space) by `choice` and `u`, all in [0, 1), and `jitter` around it; there
+    /// must be some.
     #[inline]
-    pub fn draw(&self, choice: f32, u: [f32; 2]) -> Drawn {
+    pub fn draw(&self, at: DVec3, jitter: [f32; 3], choice: f32, u: [f32; 2]) -> Drawn {
         let i = self.chances.partition_point(|&c| c <= choice).min(self.distant.len() - 1);
         let chance = self.chance(i);
         match &self.distant[i] {
-            Distant::Sky(sky) => {
-                let drawn = sky.sample(u);
-                let density = drawn.density * chance;
+            Distant::Sky(sky, guide) => {
+                let (bin, tile, v) = guide::draw(guide.around(at, jitter), u[1]);
+                let drawn = sky.sample(bin, [u[0], v]);
+                let density = drawn.density * (chance * tile / sky.parts()[bin]);
                 Drawn { toward: drawn.direction, irradiance: Vec3::from_array(drawn.radiance) / density, density }
             }
             Distant::Sun { toward, irradiance } => {
@@ -105,14 +117,18 @@ impl Lights {
     }
 
     /// Radiance that a ray along `way` runs into, each sky by the share of it that is not [`Self::draw`]'s, when `way`
-    /// was drawn with `density` (power heuristic: Veach 1997, section 9.2.4).
+    /// was drawn with `density` at `at` (power heuristic: Veach 1997, section 9.2.4). `jitter` as in that draw.
     #[inline]
-    pub fn run_into(&self, way: Vec3, density: f32) -> Vec3 {
+    pub fn run_into(&self, at: DVec3, jitter: [f32; 3], way: Vec3, density: f32) -> Vec3 {
         let mut sum = Vec3::ZERO;
         for (i, distant) in self.distant.iter().enumerate() {
-            if let Distant::Sky(sky) = distant {
-                let seen = sky.seen(way);
-                sum += Vec3::from_array(seen.radiance) * share(density, seen.density * self.chance(i));
+            if let Distant::Sky(sky, guide) = distant {
+                let (seen, bin) = sky.seen(way);
+                if sky.parts()[bin] > 0.0 {
+                    let tile = guide::chance(guide.around(at, jitter), bin) / sky.parts()[bin];
+                    let drawn = seen.density * (self.chance(i) * tile);
+                    sum += Vec3::from_array(seen.radiance) * share(density, drawn);
+                }
             }
         }
         sum

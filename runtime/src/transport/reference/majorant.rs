@@ -1,4 +1,4 @@
-//! Upper bounds of the density, brick by brick, and the walk of a ray through them.
+//! Bounds of the density from above and below, brick by brick, and the walk of a ray through them.
 //!
 //! Null-collision tracking (Woodcock et al. 1965) needs a bound of the density along the ray, and costs as many steps as
 //! the bound is deep; a bound for each brick (Szirmay-Kalos et al. 2011, Yue et al. 2010) follows the smoke. Bricks have
@@ -7,14 +7,19 @@
 
 use crate::medium::field::DensityField;
 use glam::DVec3;
+use rayon::prelude::*;
+
+/// A brick's bounds of the density: `[lower, upper]`.
+pub type Bounds = [f32; 2];
 
 /// The bounds of one frame.
 pub struct Majorants {
-    /// Largest density of each brick, x fastest.
-    bounds: Vec<f32>,
-    bricks: [usize; 3],
+    /// Those of each brick, x fastest; or the middle between them twice.
+    pub bounds: Vec<Bounds>,
+    /// Bricks along x, y, z.
+    pub bricks: [usize; 3],
     /// Cells along a side of a brick.
-    side: f64,
+    pub side: f64,
     /// Far corner of the field, node space.
     top: DVec3,
 }
@@ -24,32 +29,32 @@ impl Majorants {
     pub fn new(field: &DensityField, shift: u32) -> Self {
         let side = 1usize << shift;
         let bricks = field.dims.map(|n| (n - 1).div_ceil(side));
-        let mut bounds = vec![0.0f32; bricks.iter().product()];
         let [nx, ny, nz] = field.dims;
         // A node on the face between two bricks counts for both.
-        let of = |node: usize, a: usize| {
-            let last = (node / side).min(bricks[a] - 1);
-            let first = if node > 0 && node.is_multiple_of(side) { node / side - 1 } else { last };
-            first..=last
-        };
-        for (row, values) in field.values.chunks_exact(nx).enumerate() {
-            let (j, k) = (row % ny, row / ny);
-            debug_assert!(k < nz);
-            for (i, &value) in values.iter().enumerate() {
-                if value > 0.0 {
-                    for z in of(k, 2) {
-                        for y in of(j, 1) {
-                            for x in of(i, 0) {
-                                let bound = &mut bounds[x + bricks[0] * (y + bricks[1] * z)];
-                                *bound = bound.max(value);
-                            }
-                        }
+        let of = |brick: usize, n: usize| brick * side..((brick + 1) * side + 1).min(n);
+        let bound = |brick: usize| {
+            let (y, z) = (brick / bricks[0] % bricks[1], brick / bricks[0] / bricks[1]);
+            let (mut low, mut high) = (f32::INFINITY, 0.0f32);
+            for k in of(z, nz) {
+                for j in of(y, ny) {
+                    let line = nx * (j + ny * k);
+                    for &value in &field.values[line..line + nx][of(brick % bricks[0], nx)] {
+                        (low, high) = (low.min(value), high.max(value));
                     }
                 }
             }
-        }
+            [low, high]
+        };
+        let bounds = (0..bricks.iter().product()).into_par_iter().map(bound).collect();
         let top = DVec3::new((nx - 1) as f64, (ny - 1) as f64, (nz - 1) as f64);
         Self { bounds, bricks, side: side as f64, top }
+    }
+
+    /// Not bounds but the middle between them: for guesses of a transmittance.
+    pub fn middles(field: &DensityField, shift: u32) -> Self {
+        let mut bricks = Self::new(field, shift);
+        bricks.bounds.iter_mut().for_each(|[low, high]| (*low, *high) = (0.5 * (*low + *high), 0.5 * (*low + *high)));
+        bricks
     }
 
     /// Where a ray is inside the field's box, as distances along `direction` from `origin`, node space, at least 0.
@@ -71,7 +76,7 @@ impl Majorants {
         (near < far).then_some((near, far))
     }
 
-    /// Calls `visit(from, to, bound)` for every brick with density along the ray between the distances `near` and `far`
+    /// Calls `visit(from, to, bounds)` for every brick with density along the ray between the distances `near` and `far`
     /// (inside [`Self::span`]), in order, until it returns true.
     #[inline(always)]
     pub fn walk(
@@ -80,7 +85,7 @@ impl Majorants {
         direction: DVec3,
         near: f64,
         far: f64,
-        mut visit: impl FnMut(f64, f64, f32) -> bool,
+        mut visit: impl FnMut(f64, f64, Bounds) -> bool,
     ) {
         let start = origin + direction * near;
         let per_brick = 1.0 / self.side;
@@ -117,7 +122,7 @@ impl Majorants {
             };
             let to = leaves[axis].min(far);
             let bound = self.bounds[at as usize];
-            if bound > 0.0 && to > from && visit(from, to, bound) {
+            if bound[1] > 0.0 && to > from && visit(from, to, bound) {
                 return;
             }
             if leaves[axis] >= far {
@@ -179,9 +184,13 @@ mod tests {
                     let density = field.sample((origin + direction * t).as_vec3());
                     if density > 1e-4 {
                         met += 1;
-                        let bound = pieces.iter().filter(|p| p.0 - 1e-9 <= t && t <= p.1 + 1e-9).map(|p| p.2);
-                        let bound = bound.fold(0.0, f32::max);
-                        assert!(density <= bound * 1.00001, "{density} {bound} {shift} {origin} {direction} {t}");
+                        let bounds = pieces.iter().filter(|p| p.0 - 1e-9 <= t && t <= p.1 + 1e-9).map(|p| p.2);
+                        let bound = bounds.clone().map(|b| b[1]).fold(0.0, f32::max);
+                        let least = bounds.map(|b| b[0]).fold(f32::INFINITY, f32::min);
+                        assert!(
+                            least * 0.99999 <= density && density <= bound * 1.00001,
+                            "{density} {bound} {shift} {origin} {direction} {t}"
+                        );
                     }
                 }
             }

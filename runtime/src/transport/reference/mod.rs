@@ -14,6 +14,7 @@
 //! Cost: about 16 paths a pixel and pass where there is smoke. Same bytes on any number of threads: a pixel's numbers
 //! depend on the seed, its place and the pass alone.
 
+mod guide;
 mod lights;
 mod majorant;
 pub mod path;
@@ -127,6 +128,7 @@ pub fn trace(
     }
     let extinction = Extinction::new(medium.sigma_t);
     let space = Space::new(field, extinction.max);
+    let lights = (Lights::new(lights, field, &space, extinction.max), Sky::new(lights, None));
     let scene = Scene {
         eye: space.node(camera.position),
         space,
@@ -134,8 +136,8 @@ pub fn trace(
         extinction,
         albedo: Vec3::from_array(medium.albedo),
         g: medium.g,
-        lights: Lights::new(lights),
-        backdrop: Sky::new(lights, None),
+        lights: lights.0,
+        backdrop: lights.1,
         camera: *camera,
         orders: settings.orders.unwrap_or(LONGEST),
         seed: settings.seed,

@@ -2,9 +2,8 @@
 //!
 //! A camera ray's opacity is exact ([`super::tracking::Column`]); it ends in collisions that are spread evenly over it.
 //! From each a path goes on: at every collision one light of infinity is drawn and connected through an estimate of the
-//! transmittance, then a way is drawn from the phase function and flown along (Veach 1997, Raab et al. 2008). Where the
-//! phase function is sharper than [`MIRROR`] says, rays that run into the sky count too, both by the power heuristic;
-//! where it is not, the light's draw alone has less noise. Points light the whole piece of ray before a collision:
+//! transmittance, then a way is drawn from the phase function and flown along (Veach 1997, Raab et al. 2008). Rays that
+//! run into the sky count too, both by the power heuristic. Points light the whole piece of ray before a collision:
 //! a place on it is drawn by `1 / distance^2` to the point (equiangular: Kulla and Fajardo 2012, section 3), because at
 //! the collisions themselves that factor has no finite variance. Paths whose weight has fallen go on by chance
 //! (Russian roulette); the longest are cut, and what they still carried is reported.
@@ -20,11 +19,9 @@ use crate::march::Backdrop as _;
 use glam::{DVec3, Vec3};
 
 /// Rays through a pixel in one pass.
-pub const RAYS: u32 = 4;
+pub const RAYS: u32 = 2;
 /// Most collisions on each, for an opaque one; fewer where it is not.
-pub const ENDS: u32 = 4;
-/// g in size above which rays that run into the sky count.
-const MIRROR: f32 = 0.35;
+pub const ENDS: u32 = 8;
 /// Part of a path's first weight below which it goes on by chance.
 const FALLEN: f32 = 0.5;
 /// Collisions after which a path is cut: in an albedo of 1 a path comes out of thick smoke again after N collisions
@@ -157,40 +154,42 @@ impl Scene<'_> {
     fn follow(&self, path: Path, random: &mut Random, sum: &mut Sample) {
         let Path { mut place, mut way, mut weight, points, choice } = path;
         let fallen = FALLEN * weight.max_element();
-        let mirror = self.g.abs() > MIRROR && self.lights.has_sky();
+        let sky = self.lights.has_sky();
         for collision in 1..=LONGEST {
             weight *= self.albedo;
+            let jitter = [random.unit(), random.unit(), random.unit()];
             let stratified = collision <= 2;
             let draw = |pair: u32, random: &mut Random| {
                 if stratified { points.pair(pair + 2 * (collision - 1)) } else { [random.unit(), random.unit()] }
             };
             if self.lights.has_distant() {
                 let choice = if collision == 1 { choice } else { random.unit() };
-                let drawn = self.lights.draw(choice, draw(2, random));
+                let drawn = self.lights.draw(place, jitter, choice, draw(2, random));
                 let scattered = phase::value(self.g, way.dot(drawn.toward));
-                let counted = if mirror { share(drawn.density, scattered) } else { 1.0 };
+                let counted = if sky { share(drawn.density, scattered) } else { 1.0 };
                 let ray = self.space.ray(place, drawn.toward);
                 let through = self.space.transmittance(&ray, f64::INFINITY, &self.extinction, random);
                 sum.radiance += weight * drawn.irradiance * through * (scattered * counted);
             }
             let last = collision >= self.orders;
-            if last && !mirror {
+            if last && !sky {
                 return;
             }
             let (after, cosine) = phase::sample(self.g, way, draw(3, random));
             way = after;
             let ray = self.space.ray(place, way);
-            if mirror && last {
+            if last {
                 let through = self.space.transmittance(&ray, f64::INFINITY, &self.extinction, random);
-                sum.radiance += weight * through * self.lights.run_into(way, phase::value(self.g, cosine));
+                sum.radiance +=
+                    weight * through * self.lights.run_into(place, jitter, way, phase::value(self.g, cosine));
                 return;
             }
             if !self.lights.points.is_empty() {
                 sum.radiance += weight * self.albedo * self.point_light(&ray, way, f64::INFINITY, random);
             }
             let Some(distance) = self.space.flight(&ray, f64::INFINITY, &self.extinction, &mut weight, random) else {
-                if mirror {
-                    sum.radiance += weight * self.lights.run_into(way, phase::value(self.g, cosine));
+                if sky {
+                    sum.radiance += weight * self.lights.run_into(place, jitter, way, phase::value(self.g, cosine));
                 }
                 return;
             };

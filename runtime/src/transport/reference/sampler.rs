@@ -61,7 +61,8 @@ impl Strata {
     #[inline]
     pub fn pair(&self, pair: u32) -> [f32; 2] {
         let h = mix(self.seed ^ u64::from(pair).wrapping_mul(0xd6e8_feb8_6659_fd93));
-        let index = owen(self.index.reverse_bits(), h as u32).reverse_bits();
+        // Aligned blocks of indices stay aligned blocks: a set of 2^k points is a block of the sequence.
+        let index = owen(self.index, h as u32);
         let x = owen(index.reverse_bits(), (h >> 32) as u32);
         let y = owen(second_dimension(index), mix(h) as u32);
         let unit = |bits: u32| (bits >> 8) as f32 * (1.0 / 16_777_216.0);

@@ -47,7 +47,7 @@ pub fn erfcx(x: f32) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::transport::compensated::centres::zonal::erfcx as erfcx_f64;
+    use crate::error_function::erfcx as erfcx_f64;
 
     #[test]
     fn decay_follows_the_exponential_over_its_whole_range() {

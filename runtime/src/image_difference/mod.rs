@@ -1,5 +1,14 @@
 //! How far an image is from a reference.
 //!
+//! | file | what |
+//! |---|---|
+//! | here | RMSE, PSNR, bias, largest error |
+//! | `debiased` | the RMSE without the reference's own noise |
+//! | `uncertainty` | how sure RMSE and bias are, given that noise |
+//! | `z_test` | whether the difference can be told from noise |
+//! | `flip` | the difference that a viewer sees |
+//! | `false_colour` | differences as pictures |
+//!
 //! For samples a (test) and b (reference), over the pixels of a mask and per channel or over all three:
 //!
 //! | figure | formula |
@@ -14,6 +23,15 @@
 //! below 1e-12 of the mean magnitude. A sample that is not finite in either image is counted and named, and makes every
 //! figure void: it is never averaged, and never skipped. Cost: one pass, a few operations a sample.
 
+pub mod debiased;
+pub mod false_colour;
+pub mod flip;
+pub mod uncertainty;
+pub mod z_test;
+
+#[cfg(test)]
+mod testing;
+
 /// Two images and the pixels to compare; pixels row by row from the top.
 #[derive(Clone, Copy, Debug)]
 pub struct Pair<'a> {
@@ -25,6 +43,15 @@ pub struct Pair<'a> {
     pub reference: &'a [[f32; 3]],
     /// Which pixels count, as many as `test`; all of them if none is given.
     pub mask: Option<&'a [bool]>,
+}
+
+/// The noise of an image that is the mean of passes.
+#[derive(Clone, Copy, Debug)]
+pub struct Noise<'a> {
+    /// Standard error of every sample of the mean, as many pixels as the image; finite, at least 0, in its unit.
+    pub standard_error: &'a [[f32; 3]],
+    /// Passes that the standard errors were estimated from, at least 2; none: so many that they are exact.
+    pub passes: Option<u32>,
 }
 
 /// The figures of one channel, or of all three together.
@@ -105,6 +132,27 @@ pub enum Incomparable {
         .0.in_test, .0.in_reference, .0.first[0], .0.first[1]
     )]
     NotFinite(NotFinite),
+    /// Standard errors for another image.
+    #[error("standard errors of {found} pixels for an image of {expected}")]
+    NoiseSize {
+        /// Pixels with standard errors.
+        found: usize,
+        /// Pixels of the image.
+        expected: usize,
+    },
+    /// A standard error below zero, NaN or infinite, at a pixel that counts.
+    #[error("standard error {value} at ({x}, {y}): expected a finite number of at least 0")]
+    StandardError {
+        /// The first such sample.
+        value: f32,
+        /// Column.
+        x: usize,
+        /// Row from the top.
+        y: usize,
+    },
+    /// One pass, or none, which has no standard error.
+    #[error("standard errors from {0} passes: expected at least 2")]
+    Passes(u32),
 }
 
 /// Sums of one channel.
@@ -193,35 +241,6 @@ pub fn seen(alpha: &[f32], other: Option<&[f32]>) -> Vec<bool> {
     alpha.iter().enumerate().map(|(i, v)| is_seen(*v) || other(i)).collect()
 }
 
-/// The signed error as colour, `mean over R, G, B of (a - b)` against `scale`: white is no error, red too bright, blue
-/// too dark, full colour at `scale` and beyond. Linear in the sRGB-coded value, so that half the scale looks half as
-/// strong; the result is linear Rec.709. Pixels outside the mask are grey, pixels that are not finite magenta.
-/// `scale > 0`, in the images' unit.
-pub fn false_colour(pair: &Pair<'_>, scale: f64) -> Result<Vec<[f32; 3]>, Incomparable> {
-    match check(pair) {
-        Ok(()) | Err(Incomparable::NotFinite(_)) => {}
-        Err(e) => return Err(e),
-    }
-    let pixels = pair.test.iter().zip(pair.reference).enumerate().map(|(i, (a, b))| {
-        if !counts(pair, i) {
-            return [0.2; 3];
-        }
-        let error = (0..3).map(|c| f64::from(a[c]) - f64::from(b[c])).sum::<f64>() / 3.0;
-        if !error.is_finite() {
-            return [1.0, 0.0, 1.0];
-        }
-        let strength = (error.abs() / scale).min(1.0);
-        let faded = srgb_to_linear(1.0 - strength);
-        if error >= 0.0 { [1.0, faded, faded] } else { [faded, faded, 1.0] }
-    });
-    Ok(pixels.collect())
-}
-
-/// The inverse of the sRGB curve (IEC 61966-2-1), `v` in [0, 1].
-fn srgb_to_linear(v: f64) -> f32 {
-    (if v <= 0.04045 { v / 12.92 } else { ((v + 0.055) / 1.055).powf(2.4) }) as f32
-}
-
 fn counts(pair: &Pair<'_>, i: usize) -> bool {
     pair.mask.is_none_or(|mask| mask[i])
 }
@@ -244,8 +263,26 @@ fn check(pair: &Pair<'_>) -> Result<(), Incomparable> {
     }
 }
 
+fn check_noise(pair: &Pair<'_>, noise: &Noise<'_>) -> Result<(), Incomparable> {
+    let (found, expected) = (noise.standard_error.len(), pair.test.len());
+    if found != expected {
+        return Err(Incomparable::NoiseSize { found, expected });
+    }
+    if let Some(passes) = noise.passes.filter(|n| *n < 2) {
+        return Err(Incomparable::Passes(passes));
+    }
+    let good = |v: &f32| v.is_finite() && *v >= 0.0;
+    for (i, pixel) in noise.standard_error.iter().enumerate().filter(|(i, _)| counts(pair, *i)) {
+        if let Some(value) = pixel.iter().find(|v| !good(v)) {
+            return Err(Incomparable::StandardError { value: *value, x: i % pair.width, y: i / pair.width });
+        }
+    }
+    Ok(())
+}
+
 #[cfg(test)]
 mod tests {
+    use super::false_colour::signed;
     use super::*;
 
     fn pair<'a>(test: &'a [[f32; 3]], reference: &'a [[f32; 3]]) -> Pair<'a> {
@@ -338,7 +375,7 @@ mod tests {
             Pair { mask: Some(&[true]), ..pair(&r, &r) },
         ] {
             assert!(matches!(compare(&bad), Err(Incomparable::Size { .. })));
-            assert!(matches!(false_colour(&bad, 1.0), Err(Incomparable::Size { .. })));
+            assert!(matches!(signed(&bad, 1.0), Err(Incomparable::Size { .. })));
         }
         assert_eq!(compare(&Pair { width: 1, ..pair(&[], &[]) }), Err(Incomparable::Empty));
     }
@@ -366,17 +403,5 @@ mod tests {
             assert_eq!((d.all.relative_rmse, d.all.bias), (expected.all.relative_rmse, expected.all.bias));
             assert!((d.all.psnr - expected.all.psnr).abs() < 1e-12 * expected.all.psnr);
         }
-    }
-
-    #[test]
-    fn false_colours_show_sign_strength_mask_and_nan() {
-        let r = vec![[1.0; 3]; 6];
-        let t = vec![[1.0; 3], [1.5; 3], [0.5; 3], [9.0; 3], [f32::NAN; 3], [3.0; 3]];
-        let mask = [true, true, true, true, true, false];
-        let colours = false_colour(&Pair { width: 6, test: &t, reference: &r, mask: Some(&mask) }, 1.0).unwrap();
-        let half = srgb_to_linear(0.5);
-        assert!((half - 0.21404114).abs() < 1e-7);
-        let expected = [[1.0; 3], [1.0, half, half], [half, half, 1.0], [1.0, 0.0, 0.0], [1.0, 0.0, 1.0], [0.2; 3]];
-        assert_eq!(colours, expected);
     }
 }
