@@ -69,6 +69,7 @@ pub fn settings(args: &RenderArgs) -> Result<RenderSettings, Failure> {
         step: args.march_step.unwrap_or(0.0) as f32,
         cutoff: args.cutoff as f32,
         samples: usize::from(args.samples),
+        half_resolution: args.half_resolution,
     };
     Ok(RenderSettings { route, sh_order: usize::from(args.sh_order), scattering, march })
 }
@@ -83,6 +84,7 @@ pub fn document(settings: &RenderSettings) -> Value {
         "march_step": if settings.march.step == 0.0 { json!("automatic") } else { json!(settings.march.step) },
         "cutoff": settings.march.cutoff,
         "samples": settings.march.samples,
+        "half_resolution": settings.march.half_resolution,
     });
     match settings.route {
         Route::Grid(grid) => {

@@ -19,6 +19,7 @@ pub fn settings(args: &RenderArgs) -> Result<ReferenceSettings, Failure> {
         (args.exponential.is_some(), "--exponential"),
         (args.multiple.is_some(), "--multiple"),
         (args.march_step.is_some(), "--march-step"),
+        (args.half_resolution, "--half-resolution"),
     ];
     for (given, option) in numbers {
         does_not_apply(given, option, with)?;

@@ -3,7 +3,7 @@
 //! Every frame is made from the pack, the scene and the settings alone, never from another frame: one frame or all, one
 //! thread or many, the bytes are the same. All settings go into each image's `smokebake:settings`.
 
-use crate::cli::RenderArgs;
+use crate::cli::{Detail, RenderArgs};
 use crate::method::{Image, Maker, Method};
 use crate::progress::Progress;
 use crate::staging::{SceneChanges, Stage};
@@ -33,6 +33,7 @@ struct Job<'a> {
     scene: &'a Scene,
     /// Dials and scene, for the metadata.
     document: Value,
+    detail: Detail,
     precision: SamplePrecision,
 }
 
@@ -56,7 +57,8 @@ pub fn run(args: &RenderArgs) -> Result<(), Failure> {
     let job = Job {
         pack: &pack,
         scene,
-        document: document(&method, scene),
+        document: document(&method, args.detail, scene),
+        detail: args.detail,
         precision: if args.float { SamplePrecision::Float } else { SamplePrecision::Half },
     };
     let progress = Progress::start(args.progress, "rendering frames", frames.len() as u64 * STEPS);
@@ -90,16 +92,26 @@ pub fn run(args: &RenderArgs) -> Result<(), Failure> {
     answer::text(&format!("{count} images of {} x {} in {total:.2} s, {each:.2} s each\n", scene.width, scene.height))
 }
 
+/// As much as `detail` asks of the frame at `position` of a pack.
+pub fn read(pack: &Pack, position: usize, detail: Detail) -> Result<Frame, Error> {
+    match detail {
+        Detail::Full => Frame::read(pack, position),
+        Detail::Gaussians => Frame::read_gaussians(pack, position),
+    }
+}
+
 /// Everything that an image depends on, but for the pack: dials and scene. Image paths as the scene file has them.
-fn document(method: &Method, scene: &Scene) -> Value {
-    json!({ "render": method.document(), "scene": serde_json::to_value(scene).unwrap_or(Value::Null) })
+pub fn document(method: &Method, detail: Detail, scene: &Scene) -> Value {
+    let mut render = method.document();
+    render["detail"] = json!(if detail == Detail::Full { "full" } else { "gaussians" });
+    json!({ "render": render, "scene": serde_json::to_value(scene).unwrap_or(Value::Null) })
 }
 
 impl Job<'_> {
     fn frame(&self, position: usize, maker: &mut Maker, path: PathBuf, progress: &Progress) -> Result<Report, Failure> {
         let number = self.pack.frames()[position].frame;
         let start = Instant::now();
-        let frame = Frame::read(self.pack, position)?;
+        let frame = read(self.pack, position, self.detail)?;
         let mut seconds = vec![("decode", start.elapsed().as_secs_f64())];
         let mut steps = 0;
         let mut advance = |part: f64| {

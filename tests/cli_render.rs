@@ -49,7 +49,9 @@ fn read(folder: &Path, name: &str) -> FloatImage {
 
 #[test]
 fn a_frame_alone_in_a_sequence_and_on_any_number_of_threads_has_the_same_bytes() {
-    for dials in [&["--g", "0.7"][..], &["--route", "centres"], &["--order", "single", "--samples", "2"]] {
+    for dials in
+        [&["--g", "0.7"][..], &["--route", "centres"], &["--order", "single", "--samples", "2"], &["--half-resolution"]]
+    {
         let (all, _) = render(SUNSET, "out.####.exr", &[dials, &["--threads", "1"]].concat());
         let (one, _) = render(SUNSET, "out.%04d.exr", &[dials, &["--threads", "3", "--frames", "8"]].concat());
         let bytes = |folder: &Path, name: &str| std::fs::read(folder.join(name)).unwrap();
@@ -110,6 +112,8 @@ fn every_dial_changes_the_image_and_a_scene_may_have_y_up() {
         &["--march-step", "0.5"],
         &["--cutoff", "0.2"],
         &["--samples", "2"],
+        &["--half-resolution"],
+        &["--detail", "gaussians"],
         &["--albedo", "0.5"],
     ] {
         assert!(picture(plain, &[&["--g", "0.4", "--sigma-t", "5"], dials].concat()) != default, "{dials:?}");
@@ -130,6 +134,7 @@ fn options_that_do_not_apply_are_wrong_usage_and_not_ignored() {
         (&["--route", "centres", "--multiple", "transport"], "--multiple"),
         (&["--order", "single", "--multiple", "transport"], "--multiple"),
         (&["--order", "single", "--scatter-step", "2"], "--scatter-step"),
+        (&["--method", "reference", "--half-resolution"], "--half-resolution"),
         (&["--march-step", "5"], "--march-step"),
         (&["--cutoff", "1"], "--cutoff"),
         (&["--samples", "0"], "--samples"),
@@ -156,4 +161,22 @@ fn several_frames_with_one_name_a_missing_frame_and_a_point_light_are_refused() 
     let line = ["render", pack.to_str().unwrap(), "--scene", "scene.toml", "-o", "a.####.exr", "--progress", "none"];
     let message = refusal(folder.path(), &line);
     assert!(message.contains("light[") && message.contains("point"), "{message}");
+}
+
+#[test]
+fn the_gaussians_alone_are_the_same_smoke_by_and_large_and_the_image_says_so() {
+    let picture = |dials: &[&str]| {
+        let dials = [&["--frames", "8", "--float", "--json", "--order", "single", "--sigma-t", "5"], dials].concat();
+        let (folder, said) = render(SUNSET, "out.exr", &dials);
+        let json: Value = serde_json::from_str(&said).unwrap();
+        (read(folder.path(), "out.exr"), json["settings"]["render"].clone())
+    };
+    let (full, settings) = picture(&[]);
+    assert_eq!((settings["detail"].as_str(), settings["half_resolution"].as_bool()), (Some("full"), Some(false)));
+    let (alone, settings) = picture(&["--detail", "gaussians", "--half-resolution"]);
+    assert_eq!((settings["detail"].as_str(), settings["half_resolution"].as_bool()), (Some("gaussians"), Some(true)));
+    let opacity = |image: &FloatImage| image.channel("A").unwrap().iter().map(|&a| f64::from(a)).sum::<f64>();
+    // 40 Gaussians for a plume: a crude fit, which still has to put the smoke where it is.
+    let ratio = opacity(&alone) / opacity(&full);
+    assert!((0.7..1.4).contains(&ratio), "{ratio}");
 }

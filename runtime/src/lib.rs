@@ -5,6 +5,7 @@ pub mod backdrop;
 pub mod camera;
 pub mod error_function;
 pub mod film;
+mod half_resolution;
 pub mod image_difference;
 pub mod lanes;
 pub mod light;

@@ -11,6 +11,7 @@
 
 use crate::camera::Camera;
 use crate::film::{Film, Pixel};
+use crate::half_resolution;
 use crate::lanes::exp_neg_and_rest;
 use glam::{DAffine3, DVec3, Vec4};
 use multiversion::multiversion;
@@ -55,12 +56,14 @@ pub struct MarchSettings {
     pub cutoff: f32,
     /// Rays along a side of a pixel: `samples^2` on a regular grid, at least 1.
     pub samples: usize,
+    /// True marches a quarter of the rays and reads the other pixels between them ([`crate::half_resolution`]).
+    pub half_resolution: bool,
 }
 
 impl Default for MarchSettings {
     /// A step that fits the medium, one part in a thousand, and one ray a pixel.
     fn default() -> Self {
-        Self { step: 0.0, cutoff: 1e-3, samples: 1 }
+        Self { step: 0.0, cutoff: 1e-3, samples: 1, half_resolution: false }
     }
 }
 
@@ -197,15 +200,23 @@ pub fn march(
     let ds = volume.sample_distance(settings.step, medium.sigma_t);
     let origin = node_from_world.transform_point3(camera.position);
     let view = View { volume, camera, medium, backdrop, node_from_world, origin, ds, settings };
+    if settings.half_resolution {
+        return half_resolution::film(&view);
+    }
     let mut film = Film::new(camera.width, camera.height);
-    film.pixels.par_chunks_mut(camera.width).enumerate().for_each(|(y, row)| march_row(&view, y, row));
+    let columns: Vec<usize> = (0..camera.width).collect();
+    film.pixels
+        .par_chunks_mut(camera.width)
+        .enumerate()
+        .for_each(|(y, row)| row.copy_from_slice(&view.row(y, &columns)));
     film
 }
 
-/// All that a row of pixels is marched with.
-struct View<'a> {
+/// All that pixels are marched with.
+pub(crate) struct View<'a> {
     volume: &'a ShadedVolume,
-    camera: &'a Camera,
+    /// Where it is seen from.
+    pub(crate) camera: &'a Camera,
     medium: &'a MarchMedium,
     backdrop: &'a dyn Backdrop,
     node_from_world: DAffine3,
@@ -216,27 +227,67 @@ struct View<'a> {
     settings: &'a MarchSettings,
 }
 
-#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn march_row(view: &View, y: usize, row: &mut [Pixel]) {
-    let side = view.settings.samples;
-    let share = 1.0 / (side * side) as f32;
-    for (x, pixel) in row.iter_mut().enumerate() {
-        let (mut radiance, mut transmittance, mut depth) = ([0.0f32; 3], [0.0f32; 3], f32::INFINITY);
-        for sample in 0..side * side {
-            let at = |pixel: usize, step: usize| pixel as f64 + (step as f64 + 0.5) / side as f64;
-            let world = view.camera.direction(at(x, sample % side), at(y, sample / side));
-            let direction = view.node_from_world.transform_vector3(world);
-            let depth_per_distance = world.dot(view.camera.forward);
-            let ray = Ray { origin: view.origin, direction, ds: view.ds, depth_per_distance };
-            let marched = march_ray(view.volume, &ray, view.medium.sigma_t, view.settings.cutoff);
-            let seen = before(marched, view.medium, view.backdrop, world);
-            (0..3).for_each(|c| radiance[c] += seen.radiance[c]);
-            (0..3).for_each(|c| transmittance[c] += seen.transmittance[c]);
-            depth = depth.min(seen.depth);
-        }
-        *pixel =
-            Pixel { radiance: radiance.map(|r| r * share), transmittance: transmittance.map(|t| t * share), depth };
+impl View<'_> {
+    /// Unit directions of the rays through a rectangle of the image: its top left corner and its sides, in pixels.
+    fn rays(&self, [x, y]: [f64; 2], [across, down]: [f64; 2]) -> impl Iterator<Item = DVec3> {
+        let side = self.settings.samples;
+        let part = move |ray: usize| (ray as f64 + 0.5) / side as f64;
+        (0..side * side)
+            .map(move |ray| self.camera.direction(x + across * part(ray % side), y + down * part(ray / side)))
     }
+
+    /// The mean of the rays through a pixel, or of as many through a larger rectangle.
+    fn mean(&self, rays: impl Iterator<Item = Pixel>) -> Pixel {
+        let share = 1.0 / (self.settings.samples * self.settings.samples) as f32;
+        let mut sum = Pixel { transmittance: [0.0; 3], ..Pixel::EMPTY };
+        for ray in rays {
+            (0..3).for_each(|c| sum.radiance[c] += ray.radiance[c]);
+            (0..3).for_each(|c| sum.transmittance[c] += ray.transmittance[c]);
+            sum.depth = sum.depth.min(ray.depth);
+        }
+        let mean = |sum: [f32; 3]| sum.map(|s| s * share);
+        Pixel { radiance: mean(sum.radiance), transmittance: mean(sum.transmittance), depth: sum.depth }
+    }
+
+    /// The pixels of row `y` in some columns.
+    pub(crate) fn row(&self, y: usize, columns: &[usize]) -> Vec<Pixel> {
+        let corner = |x: usize| [x as f64, y as f64];
+        let directions: Vec<DVec3> = columns.iter().flat_map(|&x| self.rays(corner(x), [1.0; 2])).collect();
+        let marched = march_rays(self, &directions);
+        let count = self.settings.samples * self.settings.samples;
+        let pixel = |(marched, directions): (&[Pixel], &[DVec3])| {
+            let rays = marched.iter().zip(directions);
+            self.mean(rays.map(|(ray, direction)| before(*ray, self.medium, self.backdrop, *direction)))
+        };
+        marched.chunks(count).zip(directions.chunks(count)).map(pixel).collect()
+    }
+
+    /// What the medium alone leaves in rectangles of one size with these top left corners.
+    pub(crate) fn medium_alone(&self, corners: impl Iterator<Item = [f64; 2]>, size: [f64; 2]) -> Vec<Pixel> {
+        let directions: Vec<DVec3> = corners.flat_map(|corner| self.rays(corner, size)).collect();
+        let marched = march_rays(self, &directions);
+        let count = self.settings.samples * self.settings.samples;
+        marched.chunks(count).map(|rays| self.mean(rays.iter().copied())).collect()
+    }
+
+    /// Pixel (`x`, `y`), of which the medium alone leaves `marched`.
+    pub(crate) fn in_front(&self, marched: Pixel, x: usize, y: usize) -> Pixel {
+        let rays = self.rays([x as f64, y as f64], [1.0; 2]);
+        self.mean(rays.map(|direction| before(marched, self.medium, self.backdrop, direction)))
+    }
+}
+
+/// Marches rays of these directions.
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn march_rays(view: &View, directions: &[DVec3]) -> Vec<Pixel> {
+    let mut out = Vec::with_capacity(directions.len());
+    for world in directions {
+        let direction = view.node_from_world.transform_vector3(*world);
+        let depth_per_distance = world.dot(view.camera.forward);
+        let ray = Ray { origin: view.origin, direction, ds: view.ds, depth_per_distance };
+        out.push(march_ray(view.volume, &ray, view.medium.sigma_t, view.settings.cutoff));
+    }
+    out
 }
 
 /// A marched ray in front of the backdrop. The background is seen through the user's extinction, `T^ratio`; what the
@@ -434,7 +485,12 @@ mod tests {
     fn a_slab_transmits_by_beer_and_lambert_at_any_optical_depth() {
         for depth in [1e-6f32, 1e-3, 0.1, 1.0, 5.0, 20.0, 1e3, 1e6] {
             let (volume, camera) = slab(1.0, 2.0);
-            let film = see(&volume, &camera, [depth / 8.0; 3], &MarchSettings { step: 0.25, cutoff: 0.0, samples: 1 });
+            let film = see(
+                &volume,
+                &camera,
+                [depth / 8.0; 3],
+                &MarchSettings { step: 0.25, cutoff: 0.0, ..Default::default() },
+            );
             let pixel = film.pixels[4];
             let truth = (-f64::from(depth)).exp();
             // The midpoint rule is exact on the linear edges but for the sample that holds the kink.
@@ -452,7 +508,7 @@ mod tests {
         let none = dense.nodes.len() as u32;
         dense.nodes.push([[1.0, 1.0, 1.0, 0.0]; BRICK_NODES]);
         dense.places.iter_mut().filter(|p| **p == EMPTY).for_each(|p| *p = none);
-        let settings = MarchSettings { step: 0.5, cutoff: 0.0, samples: 1 };
+        let settings = MarchSettings { step: 0.5, cutoff: 0.0, ..Default::default() };
         let (a, b) = (see(&volume, &camera, [0.3; 3], &settings), see(&dense, &camera, [0.3; 3], &settings));
         assert_eq!(a.pixels, b.pixels);
         let early = see(&volume, &camera, [2.0; 3], &MarchSettings { cutoff: 1e-3, ..settings });

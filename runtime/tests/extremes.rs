@@ -336,7 +336,7 @@ fn what_a_route_or_a_dial_cannot_serve_is_refused_by_name() {
         Ok(_) => panic!("accepted"),
     };
     let march = |step, cutoff, samples| RenderSettings {
-        march: MarchSettings { step, cutoff, samples },
+        march: MarchSettings { step, cutoff, samples, ..MarchSettings::default() },
         ..RenderSettings::default()
     };
     assert!(message(march(f32::NAN, 0.0, 1)).starts_with("march step: found NaN"));

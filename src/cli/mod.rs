@@ -10,7 +10,7 @@ mod sweep;
 
 pub use bake::{AtRest, BakeArgs, GaussianCount, ResidualAddress, TeleportRule};
 pub use compare::{CompareArgs, Picture};
-pub use render::{ExponentialChoice, MethodChoice, MultipleChoice, RenderArgs, RouteChoice, ScatteringOrders};
+pub use render::{Detail, ExponentialChoice, MethodChoice, MultipleChoice, RenderArgs, RouteChoice, ScatteringOrders};
 pub use sweep::{Assignment, SweepArgs};
 
 use clap::{Args, Parser, Subcommand, ValueEnum};

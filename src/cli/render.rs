@@ -90,6 +90,16 @@ pub enum MultipleChoice {
     Diffusion,
 }
 
+/// How much of a frame is decoded.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum Detail {
+    /// Gaussians and residual: the density within the bake's promise.
+    #[default]
+    Full,
+    /// Gaussians alone: what the fit found, without reading the residual.
+    Gaussians,
+}
+
 /// Options of `render`.
 #[derive(Args, Debug)]
 pub struct RenderArgs {
@@ -104,6 +114,9 @@ pub struct RenderArgs {
     /// Frames to render [default: all in the pack].
     #[arg(long, value_name = "RANGE")]
     pub frames: Option<FrameSelection>,
+    /// How much of a frame is decoded.
+    #[arg(long, value_enum, default_value_t)]
+    pub detail: Detail,
     /// How the images are made.
     #[arg(long, value_enum, default_value_t)]
     pub method: MethodChoice,
@@ -155,6 +168,9 @@ pub struct RenderArgs {
     /// Rays along a side of a pixel: N x N rays a pixel.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=64))]
     pub samples: u8,
+    /// March one ray for every 2 x 2 pixels, and more only where those differ.
+    #[arg(long)]
+    pub half_resolution: bool,
     /// Instead of the scene's sigma_t: a number, or R,G,B.
     #[arg(long, value_name = "RGB", value_parser = rgb)]
     pub sigma_t: Option<Rgb>,

@@ -2,10 +2,11 @@
 
 use super::store::ReferenceImage;
 use super::table::{Progressed, ReferenceFigures, Seconds};
-use crate::contact_sheet;
+use crate::cli::Detail;
 use crate::failure::Failure;
 use crate::method::Method;
 use crate::staging::Stage;
+use crate::{contact_sheet, render};
 use smoke_formats::image::RgbImage;
 use smoke_formats::pack::Pack;
 use smoke_runtime::film::Film;
@@ -14,7 +15,6 @@ use smoke_runtime::image_difference::flip::flip;
 use smoke_runtime::image_difference::uncertainty::uncertainty;
 use smoke_runtime::image_difference::{self, Incomparable, Noise, Pair, false_colour};
 use smoke_runtime::medium::field::DensityField;
-use smoke_runtime::medium::frame::Frame;
 use smoke_runtime::transport::reference::{ReferenceSettings, trace};
 use std::time::Instant;
 
@@ -75,7 +75,7 @@ pub fn reference(
 pub fn render(
     pack: &Pack,
     position: usize,
-    method: &Method,
+    (method, detail): (&Method, Detail),
     stage: &Stage,
     repeat: u8,
 ) -> Result<Result<(Film, Seconds), String>, Failure> {
@@ -86,7 +86,7 @@ pub fn render(
             Err(why) => return Ok(Err(why)),
         };
         let start = Instant::now();
-        let frame = Frame::read(pack, position)?;
+        let frame = render::read(pack, position, detail)?;
         let decode = ("decode", start.elapsed().as_secs_f64());
         match maker.image(frame, &mut |_| {}) {
             Ok(image) => runs.push((Seconds::new([decode].into_iter().chain(image.seconds)), image.film)),

@@ -27,8 +27,8 @@ mod table;
 use crate::cli::{RenderArgs, SweepArgs};
 use crate::method::Method;
 use crate::progress::Progress;
-use crate::{answer, failure::Failure};
-use measure::FULL_COLOUR;
+use crate::{answer, failure::Failure, render};
+use measure::{Distance, FULL_COLOUR};
 use options::{Options, Owner};
 use points::Point;
 use rayon::ThreadPool;
@@ -37,6 +37,7 @@ use serde_json::{Value, json};
 use setting::Setting;
 use smoke_formats::pack::Pack;
 use smoke_formats::{atomic, image};
+use smoke_runtime::film::Film;
 use source::Source;
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
@@ -235,61 +236,67 @@ impl Sweep<'_> {
         point: &Point,
         (reference, truth): (&Key, &ReferenceImage),
     ) -> Result<(Key, Outcome), Failure> {
-        let render: RenderArgs = setting.options(&point.options).render()?;
+        let asked: RenderArgs = setting.options(&point.options).render()?;
         // The Debug form has every option: whatever is not the same in it is another point.
-        let (made_by, repeat) = (format!("{render:?}"), self.args.repeat.to_string());
+        let (made_by, repeat) = (format!("{asked:?}"), self.args.repeat.to_string());
         let key = Key::of(&["point", reference.as_str(), &format!("{:016x}", pack.checksum()), &made_by, &repeat]);
         if let Some(outcome) = self.store.find(&key) {
             return Ok((key, outcome));
         }
         let (position, repeat) = (self.source.position(i), self.args.repeat);
-        let pool = self.pools.get(render.threads.unwrap_or(0))?;
+        let pool = self.pools.get(asked.threads.unwrap_or(0))?;
         let threads = pool.current_num_threads();
-        let rendered = match Method::choose(&render, &setting.stage).map_err(points::conflict) {
+        let rendered = match Method::choose(&asked, &setting.stage).map_err(points::conflict) {
             Ok(method) => pool
-                .install(|| measure::render(pack, position, &method, &setting.stage, repeat))?
+                .install(|| measure::render(pack, position, (&method, asked.detail), &setting.stage, repeat))?
                 .map(|rendered| (method, rendered)),
             // Its options do not go with the order of this scene.
             Err(failure) => Err(failure?.to_string().trim_start_matches("error: ").trim().to_owned()),
         };
-        let outcome = match rendered {
+        let measured = match rendered {
+            Ok((method, (film, seconds))) => self.errors(&key, truth, &film)?.map(|errors| (method, seconds, errors)),
+            Err(why) => Err(why),
+        };
+        let outcome = match measured {
             Err(why) => Outcome::Refused(why),
-            Ok((method, (film, seconds))) => {
-                let radiance: Vec<[f32; 3]> = film.pixels.iter().map(|p| p.radiance).collect();
-                let alpha: Vec<f32> = film.pixels.iter().map(|p| p.alpha()).collect();
-                match truth.distance(&radiance, &alpha) {
-                    Err(e) => Outcome::Refused(e.to_string()),
-                    Ok(d) if !d.relative_rmse.iter().chain(&d.bias).all(|v| v.is_finite()) => {
-                        Outcome::Refused("the reference is black, and the image is not".into())
-                    }
-                    Ok(d) => {
-                        image::write_png(&self.store.picture(&key), &truth.exposed(&radiance))?;
-                        image::write_png(&self.store.difference(&key), &truth.false_colour(&radiance, &alpha)?)?;
-                        let mut document = method.document();
-                        let word = |name: &str| document[name].as_str().map(str::to_owned);
-                        let method =
-                            [word("method"), word("route")].into_iter().flatten().collect::<Vec<_>>().join(" ");
-                        document["threads"] = json!(threads);
-                        let at_rest: u64 = pack.frames().iter().map(|f| f.bytes_at_rest).sum();
-                        let active: u64 = pack.frames().iter().map(|f| f.active_voxels).sum();
-                        Outcome::Measured(Box::new(Figures {
-                            relative_rmse: d.relative_rmse[0],
-                            relative_rmse_standard_error: d.relative_rmse[1],
-                            bias: d.bias[0],
-                            bias_standard_error: d.bias[1],
-                            flip: d.flip,
-                            seconds,
-                            pack_bytes: pack.file_bytes(),
-                            bits_per_active_voxel: 8.0 * at_rest as f64 / active.max(1) as f64,
-                            method,
-                            settings: document,
-                        }))
-                    }
-                }
+            Ok((method, seconds, d)) => {
+                let mut settings = render::document(&method, asked.detail, &setting.stage.scene)["render"].take();
+                settings["threads"] = json!(threads);
+                let names = ["method", "route"].map(|name| settings[name].as_str().map(str::to_owned));
+                let at_rest: u64 = pack.frames().iter().map(|f| f.bytes_at_rest).sum();
+                let active: u64 = pack.frames().iter().map(|f| f.active_voxels).sum();
+                Outcome::Measured(Box::new(Figures {
+                    relative_rmse: d.relative_rmse[0],
+                    relative_rmse_standard_error: d.relative_rmse[1],
+                    bias: d.bias[0],
+                    bias_standard_error: d.bias[1],
+                    flip: d.flip,
+                    seconds,
+                    pack_bytes: pack.file_bytes(),
+                    bits_per_active_voxel: 8.0 * at_rest as f64 / active.max(1) as f64,
+                    method: names.into_iter().flatten().collect::<Vec<_>>().join(" "),
+                    settings,
+                }))
             }
         };
         self.store.keep(&key, &outcome)?;
         Ok((key, outcome))
+    }
+
+    /// How far a film is from the reference, its thumbnails written; an inner error where that cannot be said.
+    fn errors(&self, key: &Key, truth: &ReferenceImage, film: &Film) -> Result<Result<Distance, String>, Failure> {
+        let radiance: Vec<[f32; 3]> = film.pixels.iter().map(|p| p.radiance).collect();
+        let alpha: Vec<f32> = film.pixels.iter().map(|p| p.alpha()).collect();
+        let distance = match truth.distance(&radiance, &alpha) {
+            Ok(distance) => distance,
+            Err(e) => return Ok(Err(e.to_string())),
+        };
+        if !distance.relative_rmse.iter().chain(&distance.bias).all(|v| v.is_finite()) {
+            return Ok(Err("the reference is black, and the image is not".into()));
+        }
+        image::write_png(&self.store.picture(key), &truth.exposed(&radiance))?;
+        image::write_png(&self.store.difference(key), &truth.false_colour(&radiance, &alpha)?)?;
+        Ok(Ok(distance))
     }
 
     /// Writes CSV, JSON and page, and says where they are.

@@ -143,6 +143,7 @@ pub fn usual(density_max: Option<f32>) -> Vec<Assignment> {
         ("multiple", "diffusion".into()),
         ("samples", "2".into()),
         ("half-resolution", "true".into()),
+        ("detail", "gaussians".into()),
         ("threads", "1".into()),
     ];
     if let Some(peak) = density_max {
@@ -153,13 +154,11 @@ pub fn usual(density_max: Option<f32>) -> Vec<Assignment> {
         dials.push(("gaussians", "100,300".into()));
         dials.push(("max-error", format!("{},{},{}", part(2000.0), part(100.0), part(30.0))));
     }
-    // A dial that this program does not have (yet) has no arm.
-    let known = dials.into_iter().filter(|(name, _)| options::owner(name).is_some());
     let split = |(name, values): (&str, String)| Assignment {
         name: name.into(),
         values: values.split(',').map(str::to_owned).collect(),
     };
-    known.map(split).collect()
+    dials.into_iter().map(split).collect()
 }
 
 /// Fails if a dial is no option, is given twice, or is one of `bake` although the input is a pack.

@@ -271,3 +271,13 @@ fn a_pack_of_real_size_survives_truncation_and_two_thousand_flips() {
         assert!(right >= 20 && refused > 1500, "{right} {refused}");
     }
 }
+
+#[test]
+fn a_box_that_no_memory_holds_is_refused_before_anything_is_made_of_its_size() {
+    let dims = [1 << 30; 3];
+    let sequence = SequenceRecord { dims, ..SequenceRecord::default() };
+    let frame = FrameRecord { dims, step: 0.1, ..FrameRecord::default() };
+    let message = frame.check(path(), 3, &sequence).unwrap_err().to_string();
+    assert!(message.contains("frames[3].dims") && message.contains("at most 268435456 voxels"), "{message}");
+    assert!(FrameRecord { dims: [1 << 10, 1 << 10, 1 << 8], ..frame }.check(path(), 3, &sequence).is_ok());
+}

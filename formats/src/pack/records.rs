@@ -3,6 +3,7 @@
 //!
 //! Fields of fixed size come first, so that their offsets can be stated in `FORMAT.md`.
 
+use crate::bounded::MAX_DENSE_VOXELS;
 use crate::{Error, Result};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
@@ -221,7 +222,11 @@ impl FrameRecord {
                 return Err(Error::invalid(path, field("dims"), found, "a box inside the sequence's"));
             }
         }
-        let voxels = self.dims.iter().map(|&d| u64::from(d)).product();
+        let voxels = self.dims.iter().try_fold(1u64, |n, &d| n.checked_mul(u64::from(d)));
+        let Some(voxels) = voxels.filter(|&n| n <= MAX_DENSE_VOXELS) else {
+            let expected = format!("at most {MAX_DENSE_VOXELS} voxels");
+            return Err(Error::invalid(path, field("dims"), format!("{:?}", self.dims), expected));
+        };
         if self.active_voxels > voxels {
             return Err(Error::invalid(path, field("active_voxels"), self.active_voxels, format!("at most {voxels}")));
         }

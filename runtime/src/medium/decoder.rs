@@ -22,6 +22,23 @@ pub fn decode(gaussians: &[Gaussian], residual: &ResidualCodes, step: f32, space
     density
 }
 
+/// Density of every voxel of a frame's box by the Gaussians alone, x fastest.
+///
+/// The support is stored with the residual and unknown here. Tails that the kernels let out of the smoke are bounded by
+/// the frame's box, which is that of the support, and by half a step: a sum below that counts as no density, as it may
+/// for the residual.
+pub fn decode_gaussians(
+    gaussians: &[Gaussian],
+    origin: [i32; 3],
+    dims: [u32; 3],
+    step: f32,
+    space: &UnitSpace,
+) -> Vec<f32> {
+    let mut density = gaussian_sum(gaussians, space, origin, dims.map(|d| d as usize));
+    density.iter_mut().for_each(|d| *d = if *d >= 0.5 * step { *d } else { 0.0 });
+    density
+}
+
 /// The same as a field in the world, ready for transport and march.
 pub fn decode_field(
     gaussians: &[Gaussian],
@@ -38,6 +55,21 @@ pub fn decode_field(
 mod tests {
     use super::*;
     use smoke_formats::volume::VoxelMask;
+
+    #[test]
+    fn the_gaussians_alone_are_their_sum_down_to_half_a_step() {
+        let space = UnitSpace::of_box([10, 0, -4], [3; 3]);
+        let gaussian = Gaussian { center: [0.5; 3], radius: 0.4, weight: 0.5 };
+        let sum = gaussian_sum(&[gaussian], &space, [10, 0, -4], [3; 3]);
+        // Half a step between the corners, 0.5 exp(-(1/3) / 0.16) = 0.062, and the edges, 0.125.
+        let density = decode_gaussians(&[gaussian], [10, 0, -4], [3; 3], 0.2, &space);
+        for (v, (found, sum)) in density.iter().zip(&sum).enumerate() {
+            let is_corner = [v % 3, v / 3 % 3, v / 9].iter().all(|&i| i != 1);
+            assert_eq!(*found, if is_corner { 0.0 } else { *sum }, "voxel {v}");
+        }
+        assert!(sum.iter().all(|&s| s > 0.0) && density.iter().filter(|&&d| d == 0.0).count() == 8);
+        assert!(decode_gaussians(&[gaussian], [0; 3], [0; 3], 0.2, &space).is_empty());
+    }
 
     #[test]
     fn density_is_sum_plus_steps_on_the_support_and_zero_elsewhere() {

@@ -1,6 +1,6 @@
 //! One frame of a pack as transport needs it: density on nodes, Gaussians, and where both lie.
 
-use super::decoder::decode_field;
+use super::decoder::{decode_field, decode_gaussians};
 use super::field::DensityField;
 use glam::{DAffine3, DMat3, DVec3};
 use smoke_formats::gaussian::{Gaussian, UnitSpace};
@@ -43,6 +43,18 @@ impl Frame {
         let unit = UnitSpace::of_box(sequence.origin, sequence.dims);
         let world_from_index = DAffine3::from_cols_array(&sequence.world_from_index);
         Ok(Self::decode(gaussians, &codes, pack.frames()[number].step, unit, world_from_index))
+    }
+
+    /// Frame `number`, counted from 0, of a pack, by its Gaussians alone: the residual is not even read.
+    pub fn read_gaussians(pack: &Pack, number: usize) -> smoke_formats::Result<Self> {
+        let gaussians = pack.gaussians(number)?;
+        let (sequence, record) = (pack.sequence(), &pack.frames()[number]);
+        let unit = UnitSpace::of_box(sequence.origin, sequence.dims);
+        let world_from_index = DAffine3::from_cols_array(&sequence.world_from_index);
+        let (origin, dims) = (record.origin, record.dims);
+        let density = decode_gaussians(&gaussians, origin, dims, record.step, &unit);
+        let field = DensityField::from_box(origin, dims.map(|d| d as usize), &density, world_from_index);
+        Ok(Self { field, gaussians, unit, first_node: origin.map(|o| o.saturating_sub(1)), world_from_index })
     }
 
     /// Unit space to world.

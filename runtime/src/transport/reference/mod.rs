@@ -66,6 +66,14 @@ pub enum ReferenceError {
     /// A medium parameter out of range.
     #[error(transparent)]
     Medium(#[from] MediumError),
+    /// A pixel's radiance, which overflows for lights near the largest f32.
+    #[error("pixel ({x}, {y}): found radiance that is not finite, expected lights below 1e18")]
+    NotFinite {
+        /// Column.
+        x: usize,
+        /// Row.
+        y: usize,
+    },
     /// A setting out of range.
     #[error("{name}: found {found}, expected {expected}")]
     Setting {
@@ -152,6 +160,9 @@ pub fn trace(
             }
         });
         passes += 1;
+        if let Some(pixel) = sums.iter().position(|s| !s.radiance.iter().chain(&s.squares).all(|v| v.is_finite())) {
+            return Err(ReferenceError::NotFinite { x: pixel % camera.width, y: pixel / camera.width });
+        }
         let relative_error = relative_error(&sums, passes);
         on_pass(passes, relative_error);
         let enough = passes >= LEAST_PASSES && relative_error <= settings.target_error;

@@ -114,7 +114,7 @@ impl Scene<'_> {
             let [u, choice] = points.pair(1);
             let mut random = Random::new(mix(strata.seed ^ (u64::from(points.index) + 1)));
             if !self.lights.points.is_empty() {
-                let line = self.point_light(ray, way, f64::INFINITY, &mut random);
+                let line = self.point_light(ray, way, &mut random);
                 sum.radiance += self.albedo * line * share;
             }
             // The channel whose opacity is drawn, and a place at which that channel has become opaque so far.
@@ -157,6 +157,10 @@ impl Scene<'_> {
         let sky = self.lights.has_sky();
         for collision in 1..=LONGEST {
             weight *= self.albedo;
+            let lives = weight.max_element() > 0.0;
+            if !lives {
+                return;
+            }
             let jitter = [random.unit(), random.unit(), random.unit()];
             let stratified = collision <= 2;
             let draw = |pair: u32, random: &mut Random| {
@@ -185,7 +189,7 @@ impl Scene<'_> {
                 return;
             }
             if !self.lights.points.is_empty() {
-                sum.radiance += weight * self.albedo * self.point_light(&ray, way, f64::INFINITY, random);
+                sum.radiance += weight * self.albedo * self.point_light(&ray, way, random);
             }
             let Some(distance) = self.space.flight(&ray, f64::INFINITY, &self.extinction, &mut weight, random) else {
                 if sky {
@@ -207,11 +211,10 @@ impl Scene<'_> {
         sum.truncated += weight.element_sum() / 3.0;
     }
 
-    /// Radiance that the points send back along `ray` (unit vector of the world: `way`) by one collision on it before
-    /// `end`, albedo not yet counted.
-    fn point_light(&self, ray: &Ray, way: Vec3, end: f64, random: &mut Random) -> Vec3 {
+    /// Radiance that the points send back along `ray` (unit vector of the world: `way`) by one collision on it,
+    /// albedo not yet counted.
+    fn point_light(&self, ray: &Ray, way: Vec3, random: &mut Random) -> Vec3 {
         let Some((near, far)) = self.space.span(ray) else { return Vec3::ZERO };
-        let far = far.min(end);
         let origin = self.space.world(ray.origin);
         let mut sum = Vec3::ZERO;
         for &(position, intensity) in &self.lights.points {

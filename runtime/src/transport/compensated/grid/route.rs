@@ -4,8 +4,11 @@
 //! shorter than a Gaussian's radius that interpolation dominates the error. Here both terms live on nodes: single
 //! scattering on the density's own nodes (or every second, third ...), multiple scattering on coarser ones, because
 //! radiance that was scattered often is smooth. Measured against the centres in `docs/accuracy.md`.
+//! Where neither medium nor light has colour, one channel is carried in place of three ([`super::channels`]), up to
+//! the shaded nodes: the march reads the three of a node as one vector anyway.
 //! Cost: O(nodes x beams) + O(coarse nodes x ordinates x iterations); see [`super::single`] and [`super::scatter`].
 
+use super::channels::channels;
 use super::columns::SweepGrid;
 use super::scatter::{Ordinate, gather};
 use super::single::{WeightedBeam, single_scattering};
@@ -83,12 +86,14 @@ fn nodes(field: &DensityField, step: usize) -> usize {
 struct Layer {
     step: usize,
     dims: [usize; 3],
-    /// `[coefficient * 3 + channel][node]`.
+    /// `[coefficient * channels + channel][node]`.
     planes: Vec<Vec<f32>>,
 }
 
 /// The source radiance of a frame on its grids, in spherical harmonics.
 pub struct GridSource {
+    /// 1 where all three channels are the same, else 3.
+    pub channels: usize,
     single: Layer,
     multiple: Option<Layer>,
     /// Products that the iteration for multiple scattering took; 0 without.
@@ -127,35 +132,42 @@ impl GridTransport {
     ) -> GridSource {
         let settings = self.settings;
         let bands = (1..=MAX_ORDER).rev().find(|&b| medium.moments[b - 1].abs() > 1e-6).unwrap_or(1);
+        let channels = channels(medium, beams);
         let step = if settings.single_step == 0 { single_step(field) } else { settings.single_step };
-        let single = single_layer(self.grid(field, step), step, beams, medium, bands);
+        let single = single_layer(self.grid(field, step), step, beams, medium, (bands, channels));
         let scatters = medium.albedo.iter().any(|&a| a > 0.0) && medium.sigma_t.iter().any(|&s| s > 0.0);
         if scattering == ScatteringOrder::Single || !scatters || beams.is_empty() {
-            return GridSource { single, multiple: None, iterations: 0, residual: 0.0 };
+            return GridSource { channels, single, multiple: None, iterations: 0, residual: 0.0 };
         }
         let thickest = medium.sigma_t.iter().copied().fold(0.0, f32::max);
         let step = if settings.multiple_step == 0 { multiple_step(field, thickest) } else { settings.multiple_step };
         let bands = bands.min(settings.multiple_order.max(1));
         let grid = self.grid(field, step);
-        let first = single_layer(grid, step, beams, medium, bands);
-        let (multiple, iterations, residual) = multiple_layer(grid, first, medium, bands, &settings);
-        GridSource { single, multiple: Some(multiple), iterations, residual }
+        let first = single_layer(grid, step, beams, medium, (bands, channels));
+        let (multiple, iterations, residual) = multiple_layer(grid, first, medium, (bands, channels), &settings);
+        GridSource { channels, single, multiple: Some(multiple), iterations, residual }
     }
 }
 
-fn single_layer(grid: &SweepGrid, step: usize, beams: &[Beam], medium: &BandedMedium, bands: usize) -> Layer {
+fn single_layer(
+    grid: &SweepGrid,
+    step: usize,
+    beams: &[Beam],
+    medium: &BandedMedium,
+    (bands, channels): (usize, usize),
+) -> Layer {
     let weighted: Vec<WeightedBeam> = beams
         .iter()
         .map(|beam| {
             let harmonics = evaluate(bands, beam.toward);
-            let weight = |k: usize| {
-                let gain = medium.moments[BAND[k]] * harmonics[k];
-                std::array::from_fn(|c| medium.albedo[c] * gain * beam.irradiance[c])
+            let weight = |plane: usize| {
+                let (k, c) = (plane / channels, plane % channels);
+                medium.albedo[c] * (medium.moments[BAND[k]] * harmonics[k]) * beam.irradiance[c]
             };
-            WeightedBeam { beam: *beam, weights: (0..bands * bands).map(weight).collect() }
+            WeightedBeam { beam: *beam, weights: (0..bands * bands * channels).map(weight).collect() }
         })
         .collect();
-    Layer { step, dims: grid.dims, planes: single_scattering(grid, &weighted, medium.sigma_t) }
+    Layer { step, dims: grid.dims, planes: single_scattering(grid, &weighted, &medium.sigma_t[..channels]) }
 }
 
 /// From single scattering on the coarse nodes to what is scattered more than once.
@@ -163,7 +175,7 @@ fn multiple_layer(
     grid: &SweepGrid,
     first: Layer,
     medium: &BandedMedium,
-    bands: usize,
+    (bands, channels): (usize, usize),
     settings: &GridSettings,
 ) -> (Layer, usize, f64) {
     let directions = Directions::product(settings.rings, 2 * settings.rings);
@@ -178,9 +190,9 @@ fn multiple_layer(
     // (1 - F K) x, all planes one after the other.
     let product = |x: &[f32], out: &mut [f32]| {
         let source: Vec<Vec<f32>> = x.chunks(n).map(<[f32]>::to_vec).collect();
-        let gathered = gather(grid, &ordinates, medium.sigma_t, &source);
+        let gathered = gather(grid, &ordinates, &medium.sigma_t[..channels], &source);
         out.par_chunks_mut(n).zip(x.par_chunks(n)).enumerate().for_each(|(plane, (out, x))| {
-            let gain = medium.albedo[plane % 3] * medium.moments[BAND[plane / 3]];
+            let gain = medium.albedo[plane % channels] * medium.moments[BAND[plane / channels]];
             out.iter_mut().zip(x).zip(&gathered[plane]).for_each(|((o, x), g)| *o = x - gain * g);
         });
     };
@@ -193,14 +205,15 @@ fn multiple_layer(
 
 impl SourceRadiance for GridSource {
     fn depends_on_view(&self) -> bool {
-        self.single.planes.len() > 3
+        self.single.planes.len() > self.channels
     }
 
     fn shade(&self, field: &DensityField, eye: DVec3) -> ShadedVolume {
         let [nx, ny, _] = field.dims;
         let node_eye = field.world_from_node.inverse().transform_point3(eye);
         let linear = field.world_from_node.matrix3;
-        let bands = self.single.planes.len().div_ceil(3).isqrt();
+        let channels = self.channels;
+        let bands = (self.single.planes.len() / channels).isqrt();
         let mut nodes = vec![[0.0f32; 4]; field.values.len()];
         nodes.par_chunks_mut(nx).enumerate().for_each(|(line, out)| {
             let (j, k) = (line % ny, line / ny);
@@ -216,22 +229,23 @@ impl SourceRadiance for GridSource {
                 *y = evaluate(bands, along.normalize_or(DVec3::Z).as_vec3());
             }
             let mut row = vec![0.0f32; nx];
-            let mut sum = [vec![0.0f32; nx], vec![0.0f32; nx], vec![0.0f32; nx]];
+            let mut sum = vec![vec![0.0f32; nx]; channels];
             for layer in std::iter::once(&self.single).chain(&self.multiple) {
                 for (plane, values) in layer.planes.iter().enumerate() {
                     layer.row(values, j, k, &mut row);
-                    let sum = &mut sum[plane % 3];
+                    let sum = &mut sum[plane % channels];
                     if bands == 1 {
                         sum.iter_mut().zip(&row).for_each(|(s, v)| *s += v * Y_0);
                     } else {
                         let at = sum.iter_mut().zip(&row).zip(&harmonics);
-                        at.for_each(|((s, v), y)| *s += v * y[plane / 3]);
+                        at.for_each(|((s, v), y)| *s += v * y[plane / channels]);
                     }
                 }
             }
             for (i, node) in out.iter_mut().enumerate() {
                 // A truncated series can dip below zero beside a strong peak; radiance cannot.
-                *node = [sum[0][i].max(0.0), sum[1][i].max(0.0), sum[2][i].max(0.0), density[i]];
+                let [red, green, blue] = [0, channels / 2, channels - 1].map(|c| sum[c][i].max(0.0));
+                *node = [red, green, blue, density[i]];
             }
         });
         ShadedVolume::new(field.dims, &nodes, field.world_from_node)
@@ -358,8 +372,8 @@ mod tests {
             let medium = grey(sigma as f32, albedo as f32, 0.0).banded(4);
             let source = solve(&field, &[Light::Environment(sky.clone())], &medium, ScatteringOrder::All, &settings);
             let v = 12 + 26 * (13 + 26 * 16);
-            let multiple = source.multiple.as_ref().map_or(0.0, |m| m.planes[1][v]);
-            let found = f64::from((source.single.planes[1][v] + multiple) * Y_0);
+            let multiple = source.multiple.as_ref().map_or(0.0, |m| m.planes[0][v]);
+            let found = f64::from((source.single.planes[0][v] + multiple) * Y_0);
             let (mut sum, mut squares, walks) = (0.0, 0.0, 40_000);
             let mut state = 7u64;
             let mut uniform = || {
@@ -408,6 +422,29 @@ mod tests {
         let empty = DensityField::from_box([0; 3], [0; 3], &[], DAffine3::IDENTITY);
         let film = image(&empty, &sky, &grey(3.0, 1.0, 0.0), &settings);
         assert!(film.pixels.iter().all(|p| p.transmittance == [1.0; 3]));
+    }
+
+    #[test]
+    fn an_isotropic_phase_function_has_one_band_and_costs_one_at_any_order() {
+        let sky = [Light::Environment(Environment::constant([1.0, 0.8, 0.6]))];
+        for scattering in [ScatteringOrder::Single, ScatteringOrder::All] {
+            let solved = |order: usize, g: f32| {
+                let medium = match scattering {
+                    ScatteringOrder::Single => grey(5.0, 0.9, g).windowed(order),
+                    ScatteringOrder::All => grey(5.0, 0.9, g).banded(order),
+                };
+                solve(&ball(), &sky, &medium, scattering, &GridSettings::default())
+            };
+            let (four, one) = (solved(4, 0.0), solved(1, 0.0));
+            let planes = |source: &GridSource| {
+                let layers = std::iter::once(&source.single).chain(&source.multiple);
+                layers.flat_map(|layer| layer.planes.clone()).collect::<Vec<_>>()
+            };
+            assert!(planes(&four) == planes(&one) && planes(&one).len() <= 6, "the same planes, three a layer");
+            // Cost: as many products, and no volume pass for a new camera.
+            assert_eq!((four.iterations, four.depends_on_view()), (one.iterations, false));
+            assert!(solved(4, 0.1).depends_on_view(), "the check must see bands where there are any");
+        }
     }
 
     #[test]

@@ -27,8 +27,9 @@ pub struct Ordinate {
 /// Gathers the radiance that a source radiance sends to every node near density, projected to spherical harmonics:
 /// `K J`; zero at the others.
 ///
-/// `source` and the result are planes `[coefficient * 3 + channel]` of one value a node, x fastest.
-pub fn gather(grid: &SweepGrid, ordinates: &[Ordinate], sigma_t: [f32; 3], source: &[Vec<f32>]) -> Vec<Vec<f32>> {
+/// `source` and the result are planes `[coefficient * channels + channel]` of one value a node, x fastest; `sigma_t` is
+/// extinction per unit density and world length, one for each channel.
+pub fn gather(grid: &SweepGrid, ordinates: &[Ordinate], sigma_t: &[f32], source: &[Vec<f32>]) -> Vec<Vec<f32>> {
     let turned: Vec<Vec<f32>> = source.par_iter().map(|plane| turn(plane, grid.dims)).collect();
     let paths: Vec<Path> = ordinates.iter().map(|o| grid.path(o.toward)).collect();
     let mut order: Vec<usize> = (0..ordinates.len()).collect();
@@ -66,12 +67,12 @@ pub fn gather(grid: &SweepGrid, ordinates: &[Ordinate], sigma_t: [f32; 3], sourc
 struct Rays {
     /// [`OUTSIDE`] for a ray that has not met the grid yet.
     density: Vec<f32>,
-    source: [Vec<f32>; 3],
-    radiance: [Vec<f32>; 3],
+    source: Vec<Vec<f32>>,
+    radiance: Vec<Vec<f32>>,
     /// Integral of the density so far.
     depth: Vec<f32>,
     /// `1 - exp(-sigma_t depth)`, per channel: what a source of 1 all along the ray would have sent.
-    opacity: [Vec<f32>; 3],
+    opacity: Vec<Vec<f32>>,
 }
 
 /// Marks a ray that has not met the grid: no density is negative.
@@ -81,34 +82,34 @@ fn sweep(
     grid: &SweepGrid,
     path: &Path,
     ordinate: &Ordinate,
-    sigma_t: [f32; 3],
+    sigma_t: &[f32],
     planes: &[Vec<f32>],
     out: &mut [Vec<f32>],
 ) {
     let slices = &path.slices;
     let density = grid.density(slices);
     let rays = || vec![0.0; path.extent[0] * path.extent[1]];
-    let three = || [rays(), rays(), rays()];
+    let each = || sigma_t.iter().map(|_| rays()).collect::<Vec<_>>();
     let mut rays = Rays {
         density: vec![OUTSIDE; path.extent[0] * path.extent[1]],
-        source: three(),
-        radiance: three(),
+        source: each(),
+        radiance: each(),
         depth: rays(),
-        opacity: three(),
+        opacity: each(),
     };
     // An isotropic source is read where it lies; another is first summed up for this direction.
     let isotropic = ordinate.harmonics.len() == 1;
-    let mut summed = [0, 1, 2].map(|_| vec![0.0; if isotropic { 0 } else { slices.columns * slices.rows }]);
+    let mut summed = vec![vec![0.0; if isotropic { 0 } else { slices.columns * slices.rows }]; sigma_t.len()];
     for step in 0..slices.count {
         let shift = path.shift(step);
         let source = if isotropic {
             let start = slices.row(shift.slice, 0);
             let stride = slices.row(shift.slice, 1) - start;
-            let channels = [0, 1, 2].map(|c| &planes[c][start..]);
+            let channels = planes.iter().map(|plane| &plane[start..]).collect();
             SliceSource { channels, stride, scale: ordinate.harmonics[0] }
         } else {
             source_along(grid, slices, shift.slice, &ordinate.harmonics, planes, &mut summed);
-            let channels = [0, 1, 2].map(|c| &summed[c][..]);
+            let channels = summed.iter().map(|plane| &plane[..]).collect();
             SliceSource { channels, stride: slices.columns, scale: 1.0 }
         };
         advance(grid, &mut rays, path, &shift, sigma_t, density, &source);
@@ -118,7 +119,7 @@ fn sweep(
 
 /// The source radiance of one slice into a sweep's direction: `scale * channels[c][row * stride + column]`.
 struct SliceSource<'a> {
-    channels: [&'a [f32]; 3],
+    channels: Vec<&'a [f32]>,
     stride: usize,
     scale: f32,
 }
@@ -132,8 +133,9 @@ fn source_along(
     slice: usize,
     harmonics: &[f32],
     planes: &[Vec<f32>],
-    out: &mut [Vec<f32>; 3],
+    out: &mut [Vec<f32>],
 ) {
+    let channels = out.len();
     let n = slices.columns;
     for row in 0..slices.rows {
         // Row r is read by the rays between r - 1 and r and by those between r and r + 1.
@@ -149,10 +151,10 @@ fn source_along(
         }
         let range = first.min(n)..(end + 1).min(n);
         let at = slices.row(slice, row);
-        for channel in 0..3 {
+        for channel in 0..channels {
             let out = &mut out[channel][row * n..][range.clone()];
             for (coefficient, &y) in harmonics.iter().enumerate() {
-                let plane = &planes[coefficient * 3 + channel][at..][range.clone()];
+                let plane = &planes[coefficient * channels + channel][at..][range.clone()];
                 if coefficient == 0 {
                     out.iter_mut().zip(plane).for_each(|(o, p)| *o = y * p);
                 } else {
@@ -177,7 +179,7 @@ fn advance(
     rays: &mut Rays,
     path: &Path,
     shift: &Shift,
-    sigma_t: [f32; 3],
+    sigma_t: &[f32],
     density: &[f32],
     slice_source: &SliceSource,
 ) {
@@ -185,7 +187,7 @@ fn advance(
     let weights = shift.ray_weights();
     let source_weights = weights.map(|row| row.map(|w| w * slice_source.scale));
     let half = 0.5 * path.length;
-    let grey = sigma_t[0] == sigma_t[1] && sigma_t[0] == sigma_t[2];
+    let grey = sigma_t.iter().all(|s| *s == sigma_t[0]);
     let (mut met, mut depth, mut source, mut entering) = ([0.0; BLOCK], [0.0; BLOCK], [0.0; BLOCK], [false; BLOCK]);
     let (mut kept, mut near, mut far) = ([0.0; BLOCK], [0.0; BLOCK], [0.0; BLOCK]);
     for row in 0..slices.rows - 1 {
@@ -204,7 +206,7 @@ fn advance(
                 before[c] = met[c];
                 total[c] += depth[c];
             }
-            for channel in 0..3 {
+            for channel in 0..sigma_t.len() {
                 if channel == 0 || !grey {
                     let sigma = sigma_t[channel];
                     // Whole vectors: what lies past `len` is scratch of an earlier block, and is not read.
@@ -249,13 +251,13 @@ fn deposit(
     rays: &Rays,
     path: &Path,
     shift: &Shift,
-    sigma_t: [f32; 3],
+    sigma_t: &[f32],
     ordinate: &Ordinate,
     out: &mut [Vec<f32>],
 ) {
     let slices = &path.slices;
     let around = shift.node_weights();
-    let grey = sigma_t[0] == sigma_t[1] && sigma_t[0] == sigma_t[2];
+    let grey = sigma_t.iter().all(|s| *s == sigma_t[0]);
     let (mut reached, mut factor, mut opacity) = ([0.0; BLOCK], [0.0; BLOCK], [0.0; BLOCK]);
     for row in 0..slices.rows {
         let low = (shift.base[1] + row) * path.extent[0] + shift.base[0];
@@ -267,7 +269,7 @@ fn deposit(
             let interpolate = |out: &mut [f32; BLOCK], carried: &[f32]| {
                 stencil(&mut out[..len], &carried[low + block..], &carried[high + block..], around);
             };
-            for channel in 0..3 {
+            for channel in 0..sigma_t.len() {
                 if channel == 0 || !grey {
                     interpolate(&mut factor, &rays.depth);
                     interpolate(&mut opacity, &rays.opacity[channel]);
@@ -286,7 +288,7 @@ fn deposit(
                 }
                 for (coefficient, &y) in ordinate.harmonics.iter().enumerate() {
                     let weight = y * ordinate.weight;
-                    let plane = &mut out[coefficient * 3 + channel][target + block..][..len];
+                    let plane = &mut out[coefficient * sigma_t.len() + channel][target + block..][..len];
                     plane.iter_mut().zip(reached.iter()).for_each(|(p, r)| *p += weight * r);
                 }
             }
@@ -325,13 +327,13 @@ mod tests {
         let y0 = evaluate(1, Vec3::Z)[0];
         for sigma in [1e-6, 0.1, 1.0, 50.0, 1e6] {
             // J = 1 in every direction is J_00 = 1 / y_00.
-            let gathered = gather(&grid, &ordinates(1), [sigma; 3], &vec![vec![1.0 / y0; grid.len()]; 3]);
+            let gathered = gather(&grid, &ordinates(1), &[sigma; 3], &vec![vec![1.0 / y0; grid.len()]; 3]);
             let weigh = |o: &Ordinate| WeightedBeam {
                 beam: Beam { toward: o.toward, irradiance: [1.0; 3] },
-                weights: vec![[o.weight * y0; 3]],
+                weights: vec![o.weight * y0; 3],
             };
             let beams: Vec<WeightedBeam> = ordinates(1).iter().map(weigh).collect();
-            let transmitted = single_scattering(&grid, &beams, [sigma; 3]);
+            let transmitted = single_scattering(&grid, &beams, &[sigma; 3]);
             for v in 0..grid.len() {
                 let all = gathered[1][v] + transmitted[1][v];
                 // 1 / y0 = 4 pi y0: light from everywhere. 32 directions of a dozen slices, a few roundings each.
@@ -349,7 +351,7 @@ mod tests {
         source[..3].fill(vec![1.0 / y0; grid.len()]);
         // Projection of 1.5 w.x on y_3 = y1 w.x: 1.5 / y1.
         source[9..].fill(vec![1.5 / y1; grid.len()]);
-        let gathered = gather(&grid, &ordinates(2), [1e4; 3], &source);
+        let gathered = gather(&grid, &ordinates(2), &[1e4; 3], &source);
         let middle = 5 + 11 * (6 + 13 * 5);
         // Opaque all round: what is gathered in the middle is the source itself.
         assert!((gathered[0][middle] * y0 - 1.0).abs() < 1e-4);

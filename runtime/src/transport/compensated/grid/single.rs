@@ -13,12 +13,12 @@ use crate::light::Beam;
 use multiversion::multiversion;
 use rayon::prelude::*;
 
-/// What one beam adds to each coefficient of the source radiance, per unit of transmittance: `[coefficient][channel]`.
+/// What one beam adds to each coefficient of the source radiance, per unit of transmittance.
 pub struct WeightedBeam {
     /// The beam's direction, to the light.
     pub beam: Beam,
-    /// `albedo g^l E y_lm`.
-    pub weights: Vec<[f32; 3]>,
+    /// `albedo g^l E y_lm`, `[coefficient * channels + channel]`.
+    pub weights: Vec<f32>,
 }
 
 /// Nodes that are summed together.
@@ -28,18 +28,17 @@ const GROUP: usize = 6;
 /// Bytes of transmittances that are held at a time.
 const MOST_BYTES: usize = 256 << 20;
 
-/// Source radiance of all beams at the nodes near density, zero at the others: planes `[coefficient * 3 + channel]` of one
-/// value a node, x fastest.
+/// Source radiance of all beams at the nodes near density, zero at the others: planes
+/// `[coefficient * channels + channel]` of one value a node, x fastest; of no beams, a plane a channel.
 ///
-/// `sigma_t` is extinction per unit density and world length, per channel. Beams are summed in their order, so the result
+/// `sigma_t` is extinction per unit density and world length, one for each channel. Beams are summed in their order, so the result
 /// does not depend on the number of threads. Beams run in parallel; then nodes do, so that the sums of a few nodes stay in
 /// registers while all beams pass by, instead of all planes passing by for each beam.
-pub fn single_scattering(grid: &SweepGrid, beams: &[WeightedBeam], sigma_t: [f32; 3]) -> Vec<Vec<f32>> {
+pub fn single_scattering(grid: &SweepGrid, beams: &[WeightedBeam], sigma_t: &[f32]) -> Vec<Vec<f32>> {
     let [nx, ny, nz] = grid.dims;
-    let coefficients = beams.first().map_or(1, |b| b.weights.len());
-    let mut planes = vec![vec![0.0; grid.len()]; coefficients * 3];
-    let grey = sigma_t[0] == sigma_t[1] && sigma_t[0] == sigma_t[2];
-    let extinctions = if grey { &sigma_t[..1] } else { &sigma_t[..] };
+    let mut planes = vec![vec![0.0; grid.len()]; beams.first().map_or(sigma_t.len(), |b| b.weights.len())];
+    let grey = sigma_t.iter().all(|s| *s == sigma_t[0]);
+    let extinctions = if grey { &sigma_t[..1] } else { sigma_t };
     // Rows of transmittances are padded to whole blocks.
     let pitch = nx.next_multiple_of(LANES);
     let field = pitch * ny * nz;
@@ -91,17 +90,17 @@ struct Group {
 }
 
 fn groups(beams: &[WeightedBeam], extinctions: usize) -> Vec<Group> {
-    let planes = beams.first().map_or(0, |b| b.weights.len() * 3);
+    let planes = beams.first().map_or(0, |b| b.weights.len());
     let group = |extinction: usize, planes: &[usize]| {
         let weight = |beam: &WeightedBeam| {
             let mut weights = [0.0; GROUP];
-            weights.iter_mut().zip(planes).for_each(|(w, p)| *w = beam.weights[p / 3][p % 3]);
+            weights.iter_mut().zip(planes).for_each(|(w, p)| *w = beam.weights[*p]);
             weights
         };
         Group { extinction, planes: planes.to_vec(), weights: beams.iter().map(weight).collect() }
     };
     let of = |extinction: usize| -> Vec<Group> {
-        let own: Vec<usize> = (0..planes).filter(|p| extinctions == 1 || p % 3 == extinction).collect();
+        let own: Vec<usize> = (0..planes).filter(|p| p % extinctions == extinction).collect();
         own.chunks(GROUP).map(|planes| group(extinction, planes)).collect()
     };
     (0..extinctions).flat_map(of).collect()
@@ -254,8 +253,8 @@ mod tests {
         for d in 0..24 {
             let (z, a) = (1.0 - (d as f32 + 0.5) / 12.0, d as f32 * 2.4);
             let toward = Vec3::new((1.0 - z * z).sqrt() * a.cos(), (1.0 - z * z).sqrt() * a.sin(), z);
-            let beam = WeightedBeam { beam: Beam { toward, irradiance: [1.0; 3] }, weights: vec![[1.0, 2.0, 3.0]] };
-            let planes = single_scattering(&grid, &[beam], [1.5, 1.5, 3.0]);
+            let beam = WeightedBeam { beam: Beam { toward, irradiance: [1.0; 3] }, weights: vec![1.0, 2.0, 3.0] };
+            let planes = single_scattering(&grid, &[beam], &[1.5, 1.5, 3.0]);
             for node in [[13usize, 12, 11], [4, 20, 9], [1, 1, 1], [25, 14, 3]] {
                 let v = node[0] + field.dims[0] * (node[1] + field.dims[1] * node[2]);
                 let position = Vec3::new(node[0] as f32, node[1] as f32, node[2] as f32);
@@ -281,13 +280,13 @@ mod tests {
         let grid = SweepGrid::new(&blob());
         let beam = |e: f32| WeightedBeam {
             beam: Beam { toward: Vec3::new(0.6, 0.0, 0.8), irradiance: [e; 3] },
-            weights: vec![[e; 3]],
+            weights: vec![e; 3],
         };
         for sigma in [0.0, 1e-6, 1.0, 1e3, 1e6, 1e30] {
-            let planes = single_scattering(&grid, &[beam(1.0)], [sigma; 3]);
+            let planes = single_scattering(&grid, &[beam(1.0)], &[sigma; 3]);
             assert!(planes.iter().flatten().all(|t| (0.0..=1.0).contains(t)), "sigma_t {sigma}");
         }
-        assert!(single_scattering(&grid, &[], [1.0; 3]).iter().flatten().all(|&j| j == 0.0));
+        assert!(single_scattering(&grid, &[], &[1.0; 3]).iter().flatten().all(|&j| j == 0.0));
     }
 
     #[test]
@@ -297,12 +296,12 @@ mod tests {
             .map(|d| {
                 let toward =
                     DVec3::new((d as f64).sin(), (d as f64 * 1.7).cos(), (d as f64 * 0.3).sin()).normalize().as_vec3();
-                WeightedBeam { beam: Beam { toward, irradiance: [1.0; 3] }, weights: vec![[0.1 + d as f32; 3]] }
+                WeightedBeam { beam: Beam { toward, irradiance: [1.0; 3] }, weights: vec![0.1 + d as f32; 3] }
             })
             .collect();
         let with = |threads| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| single_scattering(&grid, &beams, [2.0; 3]))
+            pool.install(|| single_scattering(&grid, &beams, &[2.0; 3]))
         };
         assert!(with(1) == with(3));
     }
