@@ -222,7 +222,8 @@ fn the_passes_are_read_from_the_settings_of_the_reference() {
     let rgb = image::read(&folder.path().join("bare.exr")).unwrap().rgb(Path::new("bare.exr")).unwrap();
     let (zero, identity) = (vec![0.0; rgb.pixels.len()], [[0.0; 4]; 4]);
     let write = |name: &str, settings: &str| {
-        let frame = RenderedFrame { width: 64, height: 48, rgb: &rgb.pixels, alpha: &zero, depth: &zero };
+        let frame =
+            RenderedFrame { width: 64, height: 48, rgb: &rgb.pixels, alpha: &zero, depth: &zero, standard_error: None };
         let metadata = FrameMetadata {
             software: "test".into(),
             frames_per_second: None,

@@ -147,7 +147,7 @@ fn options_that_do_not_apply_are_wrong_usage_and_not_ignored() {
 }
 
 #[test]
-fn several_frames_with_one_name_a_missing_frame_and_a_point_light_are_refused() {
+fn several_frames_with_one_name_a_missing_frame_and_a_light_that_a_method_cannot_serve_are_refused() {
     let (code, message) = refused(SUNSET, "out.exr", &[]);
     assert!(code == Some(1) && message.contains("one name for 3 frames"), "{message}");
     let (code, message) = refused(SUNSET, "out.####.exr", &["--frames", "9"]);
@@ -159,8 +159,43 @@ fn several_frames_with_one_name_a_missing_frame_and_a_point_light_are_refused() 
     std::fs::write(folder.path().join("scene.toml"), std::fs::read_to_string(SUN).unwrap() + point).unwrap();
     let pack = BAKED.path().join("plume.smoke");
     let line = ["render", pack.to_str().unwrap(), "--scene", "scene.toml", "-o", "a.####.exr", "--progress", "none"];
-    let message = refusal(folder.path(), &line);
+    let message = refusal(folder.path(), &[&line[..], &["--method", "compensated"]].concat());
     assert!(message.contains("light[") && message.contains("point"), "{message}");
+    let few = ["--max-passes", "2", "--width", "12", "--height", "16"];
+    answer(folder.path(), &[&line[..], &few].concat());
+    assert!(read(folder.path(), "a.0008.exr").channel("standard_error.R").is_some(), "paths serve points");
+}
+
+#[test]
+fn the_reference_has_the_same_bytes_on_any_number_of_threads_and_tells_how_well_it_is_known() {
+    let dials = ["--method", "reference", "--frames", "8", "--max-passes", "20", "--target-error", "30%"];
+    let (one, said) = render(SUNSET, "out.exr", &[&dials[..], &["--threads", "1", "--json"]].concat());
+    let (three, _) = render(SUNSET, "out.exr", &[&dials[..], &["--threads", "3"]].concat());
+    let (seed, _) = render(SUNSET, "out.exr", &[&dials[..], &["--seed", "7"]].concat());
+    let bytes = |folder: &Path| std::fs::read(folder.join("out.exr")).unwrap();
+    assert!(bytes(one.path()) == bytes(three.path()), "threads");
+    assert!(bytes(one.path()) != bytes(seed.path()), "seed");
+    let json: Value = serde_json::from_str(&said).unwrap();
+    let frame = &json["frames"][0];
+    let (passes, error) = (frame["passes"].as_u64().unwrap(), frame["relative_error"].as_f64().unwrap());
+    assert!((16..=20).contains(&passes) && error > 0.0 && (passes == 20 || error <= 0.3), "{frame}");
+    let image = read(one.path(), "out.exr");
+    let rms = |names: [&str; 3]| {
+        let squares = names.map(|n| image.channel(n).unwrap().iter().map(|v| f64::from(*v).powi(2)).sum::<f64>());
+        squares.iter().sum::<f64>().sqrt()
+    };
+    let stored = rms(["standard_error.R", "standard_error.G", "standard_error.B"]) / rms(["R", "G", "B"]);
+    // R, G and B are stored in half: 2^-11 each.
+    assert!((stored / error - 1.0).abs() < 2e-3, "{stored} {error}");
+    for (dials, named) in [
+        (&["--method", "reference", "--beams", "4"][..], "--beams"),
+        (&["--method", "compensated", "--seed", "4"], "--seed"),
+        (&["--method", "compensated", "--order", "3"], "--order"),
+        (&["--method", "reference", "--max-passes", "1"], "--max-passes"),
+    ] {
+        let (code, message) = refused(SUNSET, "out.####.exr", dials);
+        assert!(code == Some(2) && message.contains(named), "{dials:?}: {message}");
+    }
 }
 
 #[test]
