@@ -11,27 +11,39 @@ use smoke_runtime::transport::compensated::centres::exponential::Exponential;
 use smoke_runtime::transport::compensated::centres::route::{CentreSettings, MultipleScattering};
 use smoke_runtime::transport::compensated::grid::route::GridSettings;
 
-/// The dials, after a check that each given one applies.
-pub fn settings(args: &RenderArgs) -> Result<RenderSettings, Failure> {
+/// The dials: those given, after a check that each applies, and those of `base` for the rest.
+pub fn settings(args: &RenderArgs, base: &RenderSettings) -> Result<RenderSettings, Failure> {
     let refuse = does_not_apply;
     let with = "--method compensated";
     refuse(args.target_error.is_some(), "--target-error", with)?;
     refuse(args.max_passes.is_some(), "--max-passes", with)?;
     refuse(args.seed.is_some(), "--seed", with)?;
-    let single = args.order == ScatteringOrders::SINGLE;
-    refuse(!single && args.order != ScatteringOrders::All, "--order N above 1", with)?;
+    let single = args.order == Some(ScatteringOrders::SINGLE);
+    refuse(!single && args.order.is_some_and(|o| o != ScatteringOrders::All), "--order N above 1", with)?;
     refuse(single && args.multiple.is_some(), "--multiple", "--order single")?;
     refuse(single && args.scatter_step.is_some(), "--scatter-step", "--order single")?;
     refuse(single && args.scatter_rings.is_some(), "--scatter-rings", "--order single")?;
     refuse(single && args.scatter_order.is_some(), "--scatter-order", "--order single")?;
-    let too_many = args.scatter_order.is_some_and(|order| order > args.sh_order);
+    let sh_order = args.sh_order.map_or(base.sh_order, usize::from);
+    let too_many = args.scatter_order.is_some_and(|order| usize::from(order) > sh_order);
     refuse(too_many, "--scatter-order", "a smaller --sh-order")?;
-    let route = match args.route {
-        RouteChoice::Grid => {
+    // Who sets a dial of multiple scattering wants it, even if the plan would do without.
+    let multiple_dial = args.multiple.is_some()
+        || args.scatter_step.is_some()
+        || args.scatter_rings.is_some()
+        || args.scatter_order.is_some();
+    let scattering = match args.order {
+        Some(ScatteringOrders::All) => ScatteringOrder::All,
+        Some(_) => ScatteringOrder::Single,
+        None if multiple_dial => ScatteringOrder::All,
+        None => base.scattering,
+    };
+    let route = match (args.route, base.route) {
+        (Some(RouteChoice::Grid), _) | (None, Route::Grid(_)) => {
             let with = "--route grid";
             refuse(args.exponential.is_some(), "--exponential", with)?;
             refuse(args.multiple.is_some_and(|m| m != MultipleChoice::Transport), "this --multiple", with)?;
-            let d = GridSettings::default();
+            let d = if let Route::Grid(grid) = base.route { grid } else { GridSettings::default() };
             Route::Grid(GridSettings {
                 beams: args.beams.map_or(d.beams, |v| v as usize),
                 single_step: args.source_step.map_or(d.single_step, |v| v as usize),
@@ -41,7 +53,7 @@ pub fn settings(args: &RenderArgs) -> Result<RenderSettings, Failure> {
                 ..d
             })
         }
-        RouteChoice::Centres => {
+        (Some(RouteChoice::Centres), _) | (None, Route::Centres(_)) => {
             let with = "--route centres";
             refuse(args.beams.is_some(), "--beams", with)?;
             refuse(args.source_step.is_some(), "--source-step", with)?;
@@ -49,29 +61,30 @@ pub fn settings(args: &RenderArgs) -> Result<RenderSettings, Failure> {
             refuse(args.scatter_rings.is_some(), "--scatter-rings", with)?;
             refuse(args.scatter_order.is_some(), "--scatter-order", with)?;
             refuse(args.multiple == Some(MultipleChoice::Transport), "--multiple transport", with)?;
-            let exponential = match args.exponential.unwrap_or_default() {
-                ExponentialChoice::Direct => Exponential::Direct,
-                ExponentialChoice::Pointwise => Exponential::Pointwise,
-                ExponentialChoice::Hybrid => Exponential::Hybrid,
-                ExponentialChoice::Linear => Exponential::OptimalLinear,
+            let d = if let Route::Centres(centres) = base.route { centres } else { CentreSettings::default() };
+            let exponential = match args.exponential {
+                Some(ExponentialChoice::Direct) => Exponential::Direct,
+                Some(ExponentialChoice::Pointwise) => Exponential::Pointwise,
+                Some(ExponentialChoice::Hybrid) => Exponential::Hybrid,
+                Some(ExponentialChoice::Linear) => Exponential::OptimalLinear,
+                None => d.exponential,
             };
             let multiple = match args.multiple {
                 _ if single => MultipleScattering::None,
                 Some(MultipleChoice::Diffusion) => MultipleScattering::Diffusion,
-                _ => MultipleScattering::IntegralCentres,
+                Some(_) => MultipleScattering::IntegralCentres,
+                None => d.multiple,
             };
-            let order = usize::from(args.sh_order);
-            Route::Centres(CentreSettings { order, exponential, multiple, ..CentreSettings::default() })
+            Route::Centres(CentreSettings { order: sh_order, exponential, multiple, ..d })
         }
     };
-    let scattering = if single { ScatteringOrder::Single } else { ScatteringOrder::All };
     let march = MarchSettings {
-        step: args.march_step.unwrap_or(0.0) as f32,
-        cutoff: args.cutoff as f32,
-        samples: usize::from(args.samples),
-        half_resolution: args.half_resolution,
+        step: args.march_step.map_or(base.march.step, |v| v as f32),
+        cutoff: args.cutoff.map_or(base.march.cutoff, |v| v as f32),
+        samples: args.samples.map_or(base.march.samples, usize::from),
+        half_resolution: args.half_resolution || base.march.half_resolution,
     };
-    Ok(RenderSettings { route, sh_order: usize::from(args.sh_order), scattering, march })
+    Ok(RenderSettings { route, sh_order, scattering, march })
 }
 
 /// The settings as an image's metadata has them.

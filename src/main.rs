@@ -11,6 +11,7 @@ mod failure;
 mod inspect;
 mod layers;
 mod method;
+mod plan;
 mod progress;
 mod reference;
 mod render;
@@ -47,6 +48,7 @@ fn dispatch(command: Command) -> Result<(), Failure> {
     match command {
         Command::Bake(args) => bake::run(&args),
         Command::Render(args) => render::run(&args),
+        Command::Plan(args) => plan::run(&args),
         Command::Inspect(args) => inspect::run(&args),
         Command::Validate(args) => validate::run(&args),
         Command::Unpack(args) => unpack::run(&args),

@@ -3,12 +3,14 @@
 use crate::cli::{MethodChoice, RenderArgs};
 use crate::failure::Failure;
 use crate::staging::Stage;
-use crate::{compensated, reference};
+use crate::{compensated, plan, reference};
 use clap::error::ErrorKind;
 use serde_json::{Value, json};
+use smoke_formats::pack::Pack;
 use smoke_runtime::film::Film;
 use smoke_runtime::light::Light;
 use smoke_runtime::medium::frame::Frame;
+use smoke_runtime::plan::choose::Settings;
 use smoke_runtime::renderer::{RenderSettings, Renderer, Seconds};
 use smoke_runtime::transport::reference::{ReferenceSettings, trace};
 use std::time::Instant;
@@ -54,14 +56,43 @@ pub fn does_not_apply(given: bool, option: &str, with: &str) -> Result<(), clap:
 }
 
 impl Method {
-    /// The method that the options ask for; `stage` decides where they leave it open.
+    /// The method that the options ask for, without a plan: where they leave it open, the fast method as it is by default,
+    /// or the reference if a light of `stage` needs it.
     pub fn choose(args: &RenderArgs, stage: &Stage) -> Result<Self, Failure> {
         let point = stage.lights.iter().any(|light| matches!(light, Light::Point { .. }));
         match args.method {
-            MethodChoice::Reference => reference::settings(args).map(Self::Reference),
-            MethodChoice::Auto if point => reference::settings(args).map(Self::Reference),
-            MethodChoice::Auto | MethodChoice::Compensated => compensated::settings(args).map(Self::Compensated),
+            MethodChoice::Reference => Self::traced(args, ReferenceSettings::default()),
+            MethodChoice::Auto if point => Self::traced(args, ReferenceSettings::default()),
+            MethodChoice::Auto | MethodChoice::Compensated => Self::marched(args, RenderSettings::default()),
         }
+    }
+
+    /// The same by the plan for the whole of `pack`, whichever frames are rendered; and a line that tells what the plan
+    /// chose, if it had to choose.
+    pub fn planned(args: &RenderArgs, stage: &Stage, pack: &Pack) -> Result<(Self, Option<String>), Failure> {
+        if args.method != MethodChoice::Auto {
+            let with = "a --method other than auto";
+            does_not_apply(args.error.is_some(), "--error", with)?;
+            does_not_apply(args.time.is_some(), "--time", with)?;
+            return Ok((Self::choose(args, stage)?, None));
+        }
+        let goal = plan::goal(args.error, args.time);
+        let plan = plan::of_pack(pack, None, stage, goal, args.threads)?.plan;
+        let method = match plan.settings {
+            Settings::Compensated(settings) => Self::marched(args, settings)?,
+            Settings::Reference { target_error } => {
+                Self::traced(args, ReferenceSettings { target_error, ..ReferenceSettings::default() })?
+            }
+        };
+        Ok((method, Some(plan.sentence())))
+    }
+
+    fn marched(args: &RenderArgs, base: RenderSettings) -> Result<Self, Failure> {
+        compensated::settings(args, &base).map(Self::Compensated)
+    }
+
+    fn traced(args: &RenderArgs, base: ReferenceSettings) -> Result<Self, Failure> {
+        reference::settings(args, &base).map(Self::Reference)
     }
 
     /// Name and settings, as an image's metadata has them.

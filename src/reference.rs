@@ -1,16 +1,16 @@
 //! The method `reference` of `render`: which options it takes, and what is told of its images.
 
-use crate::cli::{RenderArgs, RouteChoice, ScatteringOrders};
+use crate::cli::{RenderArgs, ScatteringOrders};
 use crate::failure::Failure;
 use crate::method::does_not_apply;
 use serde_json::{Value, json};
 use smoke_runtime::transport::reference::{Estimate, ReferenceSettings};
 
-/// What the options ask for, after a check that each given one applies.
-pub fn settings(args: &RenderArgs) -> Result<ReferenceSettings, Failure> {
+/// What the options ask for, after a check that each given one applies; to the error of `base` where they name none.
+pub fn settings(args: &RenderArgs, base: &ReferenceSettings) -> Result<ReferenceSettings, Failure> {
     let with = "--method reference";
-    does_not_apply(args.route != RouteChoice::Grid, "--route", with)?;
     let numbers = [
+        (args.route.is_some(), "--route"),
         (args.beams.is_some(), "--beams"),
         (args.source_step.is_some(), "--source-step"),
         (args.scatter_step.is_some(), "--scatter-step"),
@@ -19,16 +19,19 @@ pub fn settings(args: &RenderArgs) -> Result<ReferenceSettings, Failure> {
         (args.exponential.is_some(), "--exponential"),
         (args.multiple.is_some(), "--multiple"),
         (args.march_step.is_some(), "--march-step"),
+        (args.sh_order.is_some(), "--sh-order"),
+        (args.cutoff.is_some(), "--cutoff"),
+        (args.samples.is_some(), "--samples"),
         (args.half_resolution, "--half-resolution"),
     ];
     for (given, option) in numbers {
         does_not_apply(given, option, with)?;
     }
-    let d = ReferenceSettings::default();
+    let d = base;
     Ok(ReferenceSettings {
         orders: match args.order {
-            ScatteringOrders::All => None,
-            ScatteringOrders::UpTo(n) => Some(n),
+            None | Some(ScatteringOrders::All) => None,
+            Some(ScatteringOrders::UpTo(n)) => Some(n),
         },
         target_error: args.target_error.unwrap_or(d.target_error),
         max_passes: args.max_passes.unwrap_or(d.max_passes),

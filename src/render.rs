@@ -43,7 +43,6 @@ const STEPS: u64 = 1000;
 /// Renders the frames, one after the other, each by all threads.
 pub fn run(args: &RenderArgs) -> Result<(), Failure> {
     let stage = Stage::read(&args.scene, &changes(args))?;
-    let method = Method::choose(args, &stage)?;
     let pack = Pack::open(&args.pack)?;
     let numbers: Vec<i32> = pack.frames().iter().map(|f| f.frame).collect();
     let frames = match &args.frames {
@@ -53,6 +52,10 @@ pub fn run(args: &RenderArgs) -> Result<(), Failure> {
     let names = OutputNames::new(&args.output, frames.len())?;
     let pool = rayon::ThreadPoolBuilder::new().num_threads(args.threads.unwrap_or(0)).build();
     let pool = pool.map_err(|e| Failure::work(format!("--threads: {e}")))?;
+    let (method, said) = pool.install(|| Method::planned(args, &stage, &pack))?;
+    if let Some(said) = said {
+        eprintln!("smoke-bake: {said}");
+    }
     let scene = &stage.scene;
     let job = Job {
         pack: &pack,

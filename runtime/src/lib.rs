@@ -11,6 +11,7 @@ pub mod lanes;
 pub mod light;
 pub mod march;
 pub mod medium;
+pub mod plan;
 pub mod renderer;
 pub mod sphere;
 pub mod statistics;

@@ -155,11 +155,7 @@ impl Renderer {
         (self.source, self.shaded, self.loaded) = (None, None, None);
         let transport = match self.settings.route {
             Route::Grid(settings) => {
-                let [nx, ny, nz] = frame.field.dims;
-                let rays = [(nx, ny, nz), (ny, nx, nz), (nz, nx, ny)].map(|(a, b, c)| (a + b) * (a + c));
-                if rays.iter().any(|&rays| rays > MOST_RAYS) {
-                    return Err(RenderError::TooLong { dims: frame.field.dims });
-                }
+                check_box(frame.field.dims)?;
                 Transport::Grid(GridTransport::new(settings))
             }
             Route::Centres(settings) => {
@@ -252,6 +248,16 @@ fn solve(
             (Box::new(CentreSource::new(transport.points().clone(), radiance, frame, *placement)), marched)
         }
     })
+}
+
+/// Refuses a box of nodes that is too long and thin for the grid route.
+pub(crate) fn check_box(dims: [usize; 3]) -> Result<(), RenderError> {
+    let [nx, ny, nz] = dims;
+    let rays = [(nx, ny, nz), (ny, nx, nz), (nz, nx, ny)].map(|(a, b, c)| (a + b) * (a + c));
+    match rays.iter().all(|&rays| rays <= MOST_RAYS) {
+        true => Ok(()),
+        false => Err(RenderError::TooLong { dims }),
+    }
 }
 
 fn check_lights(lights: &[Light]) -> Result<(), RenderError> {

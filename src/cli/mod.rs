@@ -5,11 +5,13 @@
 
 mod bake;
 mod compare;
+mod plan;
 mod render;
 mod sweep;
 
 pub use bake::{AtRest, BakeArgs, GaussianCount, ResidualAddress, TeleportRule};
 pub use compare::{CompareArgs, Picture};
+pub use plan::PlanArgs;
 pub use render::{Detail, ExponentialChoice, MethodChoice, MultipleChoice, RenderArgs, RouteChoice, ScatteringOrders};
 pub use sweep::{Assignment, SweepArgs};
 
@@ -39,6 +41,8 @@ pub enum Command {
     Bake(BakeArgs),
     /// Render frames of a pack to OpenEXR.
     Render(RenderArgs),
+    /// Say which method and settings a scene needs, what can be left out, and what error and seconds to expect.
+    Plan(PlanArgs),
     /// Show what a pack holds: sequence, settings, and sizes, errors and seconds of every frame.
     Inspect(InspectArgs),
     /// Check every byte of a pack and name the first thing that is wrong.

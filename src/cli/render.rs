@@ -1,5 +1,6 @@
 //! Options of `render`.
 
+use super::plan::duration;
 use super::{ProgressMode, Rgb, cutoff, exr_pattern, march_step, ratio, rgb, threads};
 use clap::{Args, ValueEnum};
 use smoke_formats::sequence::FrameSelection;
@@ -8,7 +9,7 @@ use std::path::PathBuf;
 /// How an image is made.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
 pub enum MethodChoice {
-    /// What the scene allows.
+    /// What `plan` says: the fast method with what the scene needs, or the reference where it must be.
     #[default]
     Auto,
     /// Source radiance and a march: fast (Zhou et al. 2008, with its errors mended).
@@ -18,10 +19,9 @@ pub enum MethodChoice {
 }
 
 /// Which scattering orders are rendered.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ScatteringOrders {
     /// Light of all orders.
-    #[default]
     All,
     /// Light that was scattered at most so often, at least 1.
     UpTo(u32),
@@ -56,20 +56,18 @@ fn orders(text: &str) -> Result<ScatteringOrders, String> {
 }
 
 /// Where the source radiance is solved.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum RouteChoice {
     /// On grid nodes.
-    #[default]
     Grid,
     /// At the Gaussians' centres, as Zhou et al. 2008 do.
     Centres,
 }
 
 /// From optical depth to transmittance, at centres.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum ExponentialChoice {
     /// True depths along directions; right at any depth.
-    #[default]
     Direct,
     /// Harmonics of the depth, exponentiated along directions; good to depth 3.
     Pointwise,
@@ -120,9 +118,15 @@ pub struct RenderArgs {
     /// How the images are made.
     #[arg(long, value_enum, default_value_t)]
     pub method: MethodChoice,
-    /// Scattering orders: single, all, or at most N (method reference).
-    #[arg(long, value_name = "ORDERS", default_value_t, value_parser = orders)]
-    pub order: ScatteringOrders,
+    /// Error to meet, such as 5%: relative RMSE over the pixels with smoke (method auto).
+    #[arg(long, value_name = "ERROR", value_parser = ratio, conflicts_with = "time")]
+    pub error: Option<f64>,
+    /// Seconds a frame to fit in, such as 0.1s or 100ms, as predicted for --threads or 2 (method auto).
+    #[arg(long, value_name = "TIME", value_parser = duration)]
+    pub time: Option<f64>,
+    /// Scattering orders: single, all, or at most N (method reference) [default: all].
+    #[arg(long, value_name = "ORDERS", value_parser = orders)]
+    pub order: Option<ScatteringOrders>,
     /// Relative standard error at which an image is finished, such as 1% (method reference) [default: 2%].
     #[arg(long, value_name = "ERROR", value_parser = ratio)]
     pub target_error: Option<f64>,
@@ -132,12 +136,12 @@ pub struct RenderArgs {
     /// Seed of the paths (method reference) [default: 1].
     #[arg(long, value_name = "N")]
     pub seed: Option<u64>,
-    /// Where the source radiance is solved (method compensated).
-    #[arg(long, value_enum, default_value_t)]
-    pub route: RouteChoice,
-    /// Order of the spherical harmonics of phase function and source radiance.
-    #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u8).range(1..=6))]
-    pub sh_order: u8,
+    /// Where the source radiance is solved (method compensated) [default: grid].
+    #[arg(long, value_enum)]
+    pub route: Option<RouteChoice>,
+    /// Order of the spherical harmonics of phase function and source radiance [default: 4].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=6))]
+    pub sh_order: Option<u8>,
     /// Beams that an environment is cut into (route grid) [default: 64].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=65536))]
     pub beams: Option<u32>,
@@ -162,12 +166,12 @@ pub struct RenderArgs {
     /// Voxels between samples along a ray [default: 1, less where the medium is thick].
     #[arg(long, value_name = "VOXELS", value_parser = march_step)]
     pub march_step: Option<f64>,
-    /// Transmittance below which a ray ends.
-    #[arg(long, value_name = "T", default_value_t = 0.001, value_parser = cutoff)]
-    pub cutoff: f64,
-    /// Rays along a side of a pixel: N x N rays a pixel.
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=64))]
-    pub samples: u8,
+    /// Transmittance below which a ray ends [default: 0.001].
+    #[arg(long, value_name = "T", value_parser = cutoff)]
+    pub cutoff: Option<f64>,
+    /// Rays along a side of a pixel: N x N rays a pixel [default: 1].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=64))]
+    pub samples: Option<u8>,
     /// March one ray for every 2 x 2 pixels, and more only where those differ.
     #[arg(long)]
     pub half_resolution: bool,

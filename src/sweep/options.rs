@@ -160,7 +160,7 @@ mod tests {
     fn options_become_the_arguments_that_the_command_line_would_give() {
         let options = Options::default().with("sh-order", "2").with("gaussians", "50").with("sh-order", "3");
         let render = options.render().unwrap();
-        assert_eq!((render.sh_order, options.iter().count(), options.has("gaussians")), (3, 2, true));
+        assert_eq!((render.sh_order, options.iter().count(), options.has("gaussians")), (Some(3), 2, true));
         let bake = options.bake(Path::new("in.####.vdb"), Path::new("out.smoke"), "-3,5", true).unwrap();
         assert_eq!((bake.gaussians, bake.resume, bake.output.to_str()), (50, true, Some("out.smoke")));
         assert!(bake.frames.is_some());

@@ -51,8 +51,8 @@ pub fn all(args: &SweepArgs) -> Result<Vec<Setting>, Failure> {
             let render = options.render()?;
             let stage = stage.changed(scene, &SceneChanges { width, height, ..render::changes(&render) })?;
             let orders = match render.order {
-                ScatteringOrders::All => None,
-                ScatteringOrders::UpTo(orders) => Some(orders),
+                None | Some(ScatteringOrders::All) => None,
+                Some(ScatteringOrders::UpTo(orders)) => Some(orders),
             };
             all.push(Setting { scene: scene.clone(), axes: axes.clone(), stage, orders });
         }

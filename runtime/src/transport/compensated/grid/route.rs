@@ -63,7 +63,7 @@ const MOST_MULTIPLE_NODES: usize = 1_500_000;
 
 /// The finest spacing, in voxels, whose nodes stay below [`MOST_SINGLE_NODES`].
 pub fn single_step(field: &DensityField) -> usize {
-    (1..).find(|step| nodes(field, *step) <= MOST_SINGLE_NODES).unwrap_or(1)
+    (1..).find(|step| nodes(field.dims, *step) <= MOST_SINGLE_NODES).unwrap_or(1)
 }
 
 /// Two voxels, or more where that is too many nodes; one voxel where two would be more than 0.4 of optical depth at the
@@ -75,11 +75,17 @@ pub fn multiple_step(field: &DensityField, sigma_t: f32) -> usize {
     let voxel = field.world_from_node.matrix3.determinant().abs().cbrt();
     let depth = if count == 0 { 0.0 } else { sum / count as f64 * voxel * f64::from(sigma_t) };
     let finest = if depth > 0.2 { 1 } else { 2 };
-    (finest..).find(|step| nodes(field, *step) <= MOST_MULTIPLE_NODES).unwrap_or(2)
+    least_multiple_step(field.dims).max(finest)
 }
 
-fn nodes(field: &DensityField, step: usize) -> usize {
-    field.dims.iter().map(|n| (n - 1) / step + 3).product()
+/// The finest spacing of the multiple-scattering nodes, in voxels, whose nodes stay below [`MOST_MULTIPLE_NODES`].
+pub fn least_multiple_step(dims: [usize; 3]) -> usize {
+    (1..).find(|step| nodes(dims, *step) <= MOST_MULTIPLE_NODES).unwrap_or(2)
+}
+
+/// Nodes `step` >= 1 voxels apart that a field of `dims` nodes is solved on.
+pub fn nodes(dims: [usize; 3], step: usize) -> usize {
+    dims.iter().map(|n| (n - 1) / step + 3).product()
 }
 
 /// Planes of coefficients on nodes `step` voxels apart.
