@@ -22,6 +22,27 @@ pub fn run(args: &BakeArgs) -> Result<(), Failure> {
 }
 
 fn bake(args: &BakeArgs) -> Result<(), Failure> {
+    let (survey, settings) = prepare(args)?;
+    if args.dry_run {
+        return plan(args, &survey, &settings);
+    }
+    let pack = write(args, &survey, &settings)?;
+    let times = seconds::read(&pack);
+    if args.json {
+        answer::json(&inspect::as_json(&pack, times.as_deref())?)
+    } else {
+        answer::text(&inspect::summary(&pack))
+    }
+}
+
+/// Bakes as `bake` does, and answers with the pack instead of words. On the current pool of threads.
+pub fn pack(args: &BakeArgs) -> Result<Pack, Failure> {
+    let (survey, settings) = prepare(args)?;
+    write(args, &survey, &settings)
+}
+
+/// Reads every frame once.
+fn prepare(args: &BakeArgs) -> Result<(Survey, BakeSettings), Failure> {
     let (name, frames) = frames(args)?;
     pipeline::check_output(&args.output, &frames)?;
     let settings = settings(args, name);
@@ -30,20 +51,16 @@ fn bake(args: &BakeArgs) -> Result<(), Failure> {
     let survey = survey(&frames, &args.grid, args.clamp, &|| progress.advance(1))?;
     progress.finish();
     report_clamped(&survey);
-    if args.dry_run {
-        return plan(args, &survey, &settings);
-    }
-    let json = settings_json(args, &settings, &survey);
+    Ok((survey, settings))
+}
+
+/// The pack, and the seconds beside it.
+fn write(args: &BakeArgs, survey: &Survey, settings: &BakeSettings) -> Result<Pack, Failure> {
+    let json = settings_json(args, settings, survey);
     let times =
-        watch(args, &survey, |observe| pipeline::bake(&survey, &settings, &json, &args.output, args.resume, observe))?;
+        watch(args, survey, |observe| pipeline::bake(survey, settings, &json, &args.output, args.resume, observe))?;
     seconds::write(&args.output, &times)?;
-    let pack = Pack::open(&args.output)?;
-    let times = seconds::read(&pack);
-    if args.json {
-        answer::json(&inspect::as_json(&pack, times.as_deref())?)
-    } else {
-        answer::text(&inspect::summary(&pack))
-    }
+    Ok(Pack::open(&args.output)?)
 }
 
 /// The sequence's name and the frames to bake; gaps are told by name.

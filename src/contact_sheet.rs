@@ -26,12 +26,10 @@ pub fn contact_sheet(frames: &[RgbImage], columns: usize, width: usize) -> RgbIm
     let exposure = exposure(frames);
     for (i, frame) in frames.iter().enumerate() {
         let (left, top) = (i % columns * (width + LINE), i / columns * (height + LINE));
-        for (y, row) in thumbnail(frame, width, height).chunks(width).enumerate() {
+        let small = thumbnail(frame, [width, height], exposure);
+        for (y, row) in small.pixels.chunks(width).enumerate() {
             let at = left + sheet_width * (top + y);
-            for (out, pixel) in pixels[at..at + width].iter_mut().zip(row) {
-                let finite = pixel.iter().all(|v| v.is_finite());
-                *out = if finite { pixel.map(|v| (v * exposure).clamp(0.0, 1.0) as f32) } else { [1.0, 0.0, 1.0] };
-            }
+            pixels[at..at + width].copy_from_slice(row);
         }
     }
     RgbImage { width: sheet_width, height: sheet_height, pixels }
@@ -39,7 +37,7 @@ pub fn contact_sheet(frames: &[RgbImage], columns: usize, width: usize) -> RgbIm
 
 /// The factor that takes the 99.5th percentile of the brightest channel, over pixels that are not black, to 1.
 /// Black pixels are left out because most of a frame around a small plume is empty.
-fn exposure(frames: &[RgbImage]) -> f64 {
+pub fn exposure(frames: &[RgbImage]) -> f64 {
     let brightest = |p: &[f32; 3]| p[0].max(p[1]).max(p[2]);
     let pixels = frames.iter().flat_map(|f| &f.pixels).filter(|p| p.iter().all(|v| v.is_finite()));
     let mut values: Vec<f32> = pixels.map(brightest).filter(|v| *v > 0.0).collect();
@@ -51,8 +49,9 @@ fn exposure(frames: &[RgbImage]) -> f64 {
     1.0 / f64::from(*white)
 }
 
-/// `frame` box-filtered to `width` x `height`.
-fn thumbnail(frame: &RgbImage, width: usize, height: usize) -> Vec<[f64; 3]> {
+/// `frame` box-filtered to `size` (width and height, at least 1), times `exposure`, cut to [0, 1]. Pixels that are not
+/// finite are magenta.
+pub fn thumbnail(frame: &RgbImage, [width, height]: [usize; 2], exposure: f64) -> RgbImage {
     let (across, down) = (spans(frame.width, width), spans(frame.height, height));
     let pixel = |x: &[(usize, f64)], y: &[(usize, f64)]| {
         let mut sum = [0.0; 3];
@@ -62,9 +61,13 @@ fn thumbnail(frame: &RgbImage, width: usize, height: usize) -> Vec<[f64; 3]> {
                 (0..3).for_each(|c| sum[c] += weight_x * weight_y * f64::from(source[c]));
             }
         }
-        sum
+        match sum.iter().all(|v| v.is_finite()) {
+            true => sum.map(|v| (v * exposure).clamp(0.0, 1.0) as f32),
+            false => [1.0, 0.0, 1.0],
+        }
     };
-    down.iter().flat_map(|y| across.iter().map(move |x| pixel(x, y))).collect()
+    let pixels = down.iter().flat_map(|y| across.iter().map(move |x| pixel(x, y))).collect();
+    RgbImage { width, height, pixels }
 }
 
 /// For each of `to` pixels: the pixels of `from` that it covers, with their shares, which add up to 1.

@@ -17,6 +17,7 @@ mod reference;
 mod render;
 mod seconds;
 mod staging;
+mod sweep;
 #[cfg(test)]
 mod testing;
 mod unpack;
@@ -52,6 +53,7 @@ fn dispatch(command: Command) -> Result<(), Failure> {
         Command::Validate(args) => validate::run(&args),
         Command::Unpack(args) => unpack::run(&args),
         Command::Compare(args) => compare::run(&args),
+        Command::Sweep(args) => sweep::run(&args),
         Command::Demo(args) => demo::run(&args),
     }
 }

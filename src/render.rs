@@ -95,8 +95,16 @@ pub fn run(args: &RenderArgs) -> Result<(), Failure> {
     answer::text(&format!("{count} images of {} x {} in {total:.2} s, {each:.2} s each\n", scene.width, scene.height))
 }
 
+/// As much as `detail` asks of the frame at `position` of a pack.
+pub fn read(pack: &Pack, position: usize, detail: Detail) -> Result<Frame, Error> {
+    match detail {
+        Detail::Full => Frame::read(pack, position),
+        Detail::Gaussians => Frame::read_gaussians(pack, position),
+    }
+}
+
 /// Everything that an image depends on, but for the pack: dials and scene. Image paths as the scene file has them.
-fn document(method: &Method, detail: Detail, scene: &Scene) -> Value {
+pub fn document(method: &Method, detail: Detail, scene: &Scene) -> Value {
     let mut render = method.document();
     render["detail"] = json!(if detail == Detail::Full { "full" } else { "gaussians" });
     json!({ "render": render, "scene": serde_json::to_value(scene).unwrap_or(Value::Null) })
@@ -106,10 +114,7 @@ impl Job<'_> {
     fn frame(&self, position: usize, maker: &mut Maker, path: PathBuf, progress: &Progress) -> Result<Report, Failure> {
         let number = self.pack.frames()[position].frame;
         let start = Instant::now();
-        let frame = match self.detail {
-            Detail::Full => Frame::read(self.pack, position),
-            Detail::Gaussians => Frame::read_gaussians(self.pack, position),
-        }?;
+        let frame = read(self.pack, position, self.detail)?;
         let mut seconds = vec![("decode", start.elapsed().as_secs_f64())];
         let mut steps = 0;
         let mut advance = |part: f64| {
@@ -169,7 +174,7 @@ fn fraction(fps: f64) -> Option<(i32, u32)> {
 }
 
 /// What the command line changes in the scene.
-fn changes(args: &RenderArgs) -> SceneChanges {
+pub fn changes(args: &RenderArgs) -> SceneChanges {
     let RenderArgs { sigma_t, albedo, g, width, height, .. } = *args;
     SceneChanges { sigma_t, albedo, g, width, height }
 }

@@ -40,22 +40,36 @@ pub struct Stage {
 impl Stage {
     /// Reads the scene file at `path` and the images that it names.
     pub fn read(path: &Path, changes: &SceneChanges) -> Result<Self, Failure> {
-        let mut scene = Scene::read(path)?;
-        scene.medium.sigma_t = changes.sigma_t.unwrap_or(scene.medium.sigma_t);
-        scene.medium.albedo = changes.albedo.unwrap_or(scene.medium.albedo);
-        scene.medium.g = changes.g.unwrap_or(scene.medium.g);
-        scene.width = changes.width.unwrap_or(scene.width);
-        scene.height = changes.height.unwrap_or(scene.height);
-        scene.validate(path)?;
+        let scene = changed(Scene::read(path)?, path, changes)?;
         let lights = lights(&scene)?;
+        Ok(Self::of(scene, lights))
+    }
+
+    /// The same scene, read from `path`, with other values; its images are not read again.
+    pub fn changed(&self, path: &Path, changes: &SceneChanges) -> Result<Self, Failure> {
+        Ok(Self::of(changed(self.scene.clone(), path, changes)?, self.lights.clone()))
+    }
+
+    fn of(scene: Scene, lights: Vec<Light>) -> Self {
         let medium = MediumParameters {
             sigma_t: scene.medium.sigma_t.map(|v| v as f32),
             albedo: scene.medium.albedo.map(|v| v as f32),
             g: scene.medium.g as f32,
         };
         let camera = Camera::from_pinhole(&scene.pinhole());
-        Ok(Self { scene, medium, lights, camera })
+        Self { scene, medium, lights, camera }
     }
+}
+
+/// `scene` with other values, checked.
+fn changed(mut scene: Scene, path: &Path, changes: &SceneChanges) -> Result<Scene, Failure> {
+    scene.medium.sigma_t = changes.sigma_t.unwrap_or(scene.medium.sigma_t);
+    scene.medium.albedo = changes.albedo.unwrap_or(scene.medium.albedo);
+    scene.medium.g = changes.g.unwrap_or(scene.medium.g);
+    scene.width = changes.width.unwrap_or(scene.width);
+    scene.height = changes.height.unwrap_or(scene.height);
+    scene.validate(path)?;
+    Ok(scene)
 }
 
 /// The scene's lights for the renderer; reads the environment images.

@@ -1,9 +1,13 @@
-//! A small pack for unit tests of the subcommands around it.
+//! A small pack and a scene for unit tests of the subcommands around them.
 
+use crate::staging::Stage;
 use smoke_formats::gaussian::Gaussian;
 use smoke_formats::pack::{AtRest, FrameData, FrameRecord, Promise, SequenceRecord, SettingsRecord, write};
 use smoke_formats::residual::ResidualCodes;
+use smoke_formats::scene::Scene;
 use smoke_formats::volume::VoxelMask;
+use smoke_runtime::camera::Camera;
+use smoke_runtime::transport::medium::MediumParameters;
 use std::path::Path;
 
 /// Writes a pack of the given frames, 4 x 3 x 2 voxels of 0.5 world units at index (10, -2, 0), every other voxel in the
@@ -37,4 +41,13 @@ pub fn small_pack(path: &Path, frames: &[i32], step: f32) {
         writer.finish(&sequence, &settings)
     });
     filled.unwrap();
+}
+
+/// A scene without lights, 8 x 6 pixels.
+pub fn stage() -> Stage {
+    let text = "[camera]\nposition = [0, 0, 0]\ntarget = [1, 0, 0]\nfov = 30\n[image]\nwidth = 8\nheight = 6\n\
+                [medium]\nsigma_t = 1\n";
+    let scene = Scene::parse(Path::new("scene.toml"), text).unwrap();
+    let camera = Camera::from_pinhole(&scene.pinhole());
+    Stage { scene, medium: MediumParameters { sigma_t: [1.0; 3], albedo: [1.0; 3], g: 0.0 }, lights: vec![], camera }
 }

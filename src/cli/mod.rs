@@ -7,11 +7,13 @@ mod bake;
 mod compare;
 mod plan;
 mod render;
+mod sweep;
 
 pub use bake::{AtRest, BakeArgs, GaussianCount, ResidualAddress, TeleportRule};
 pub use compare::{CompareArgs, Picture};
 pub use plan::PlanArgs;
 pub use render::{Detail, ExponentialChoice, MethodChoice, MultipleChoice, RenderArgs, RouteChoice, ScatteringOrders};
+pub use sweep::{Assignment, SweepArgs};
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use smoke_formats::sequence::FrameSelection;
@@ -49,6 +51,8 @@ pub enum Command {
     Unpack(UnpackArgs),
     /// Measure how far an image is from a reference: RMSE, bias, FLIP, and a test against its noise.
     Compare(CompareArgs),
+    /// Measure what every dial costs and buys, against a reference: tables and a page of plots.
+    Sweep(SweepArgs),
     /// Bake and render a small plume that comes with the program, and relight it.
     Demo(DemoArgs),
 }

@@ -4,6 +4,7 @@
 //! |---|---|
 //! | here | RMSE, PSNR, bias, largest error |
 //! | `debiased` | the RMSE without the reference's own noise |
+//! | `uncertainty` | how sure RMSE and bias are, given that noise |
 //! | `z_test` | whether the difference can be told from noise |
 //! | `flip` | the difference that a viewer sees |
 //! | `false_colour` | differences as pictures |
@@ -25,6 +26,7 @@
 pub mod debiased;
 pub mod false_colour;
 pub mod flip;
+pub mod uncertainty;
 pub mod z_test;
 
 #[cfg(test)]

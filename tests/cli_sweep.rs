@@ -1,0 +1,152 @@
+//! `sweep` through the binary, on the shipped plume at thumbnail size: tables, page, axes, a kill and what follows it, and
+//! bad input.
+
+mod common;
+
+use common::{answer, command, refusal, smoke_bake, text};
+use serde_json::Value;
+use std::path::Path;
+use std::process::Stdio;
+use std::sync::LazyLock;
+use std::time::{Duration, Instant};
+
+/// Light from everywhere and a sun, on the shipped plume; quick to read.
+const SCENE: &str = "[camera]\nposition = [1.1, -3.5, 0.95]\ntarget = [1.37, 1.3, 1.64]\nfov = 29.0\n[image]\nwidth = 30\n\
+                     height = 40\n[medium]\nsigma_t = 8\nalbedo = 0.9\n[[light]]\nkind = \"environment\"\n\
+                     color = [0.4, 0.6, 1.0]\n[[light]]\nkind = \"directional\"\ndirection = [1, 0.4, -0.5]\n\
+                     irradiance = [3, 2, 1]\n";
+
+/// A folder with the scene, and a quickly made pack of frame 8.
+static FOLDER: LazyLock<tempfile::TempDir> = LazyLock::new(|| {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("scene.toml"), SCENE).unwrap();
+    let fit = ["--gaussians", "40", "--first-evaluations", "10", "--max-error", "0.004"];
+    let line = ["bake", common::PLUME, "-o", "plume.smoke", "--frames", "8", "--progress", "none"];
+    answer(folder.path(), &[&line[..], &fit].concat());
+    folder
+});
+
+/// A sweep of `input` into `output`, with what makes it quick.
+fn line<'a>(input: &'a str, output: &'a str, more: &[&'a str]) -> Vec<&'a str> {
+    let line = ["sweep", input, "--scene", "scene.toml", "-o", output, "--progress", "none"];
+    [&line[..], &["--frames", "8", "--repeat", "1", "--reference-error", "5%"], more].concat()
+}
+
+/// The CSV of a sweep without its seconds: a line of names, and the rows.
+fn rows(folder: &Path) -> (Vec<String>, Vec<Vec<String>>) {
+    let csv = std::fs::read_to_string(folder.join("sweep.csv")).unwrap();
+    // The last column, the settings, is the only one with commas.
+    let split = |line: &str, columns: usize| line.splitn(columns, ',').map(str::to_owned).collect::<Vec<_>>();
+    let names = split(csv.lines().next().unwrap(), 99);
+    let keep: Vec<usize> = (0..names.len()).filter(|&i| !names[i].ends_with("_seconds")).collect();
+    let pick = |row: Vec<String>| keep.iter().map(|&i| row[i].clone()).collect::<Vec<_>>();
+    let rows = csv.lines().skip(1).map(|line| pick(split(line, names.len()))).collect();
+    (pick(names), rows)
+}
+
+#[test]
+fn a_sweep_of_volumes_measures_every_dial_and_writes_tables_and_one_page() {
+    let folder = FOLDER.path();
+    let bake = ["--set", "gaussians=40", "--set", "first-evaluations=10", "--set", "scatter-step=8"];
+    let dials = ["--dial", "source-step=4", "--dial", "max-error=0.004,0.1", "--json"];
+    let said = answer(folder, &line(common::PLUME, "volumes", &[&bake[..], &dials].concat()));
+    let json: Value = serde_json::from_str(&said).unwrap();
+    let out = folder.join("volumes");
+    assert_eq!(said, std::fs::read_to_string(out.join("sweep.json")).unwrap());
+    let error = |row: usize| json["rows"][row]["relative_rmse"].as_f64().unwrap();
+    let bits = |row: usize| json["rows"][row]["bits_per_active_voxel"].as_f64().unwrap();
+    let name = |row: usize| format!("{} {}", json["rows"][row]["dial"], json["rows"][row]["value"]);
+    let expected = ["defaults ", "source-step 4", "max-error 0.004", "max-error 0.1"];
+    assert_eq!([0, 1, 2, 3].map(|row| name(row).replace('"', "")), expected);
+    assert!(json["rows"].as_array().unwrap().len() == 4 && json["refused"].as_array().unwrap().is_empty());
+    // Against the volume itself, a looser promise is a larger error in fewer bits; the method's own error is far below.
+    assert!(error(0) < 0.2 && error(3) > 1.2 * error(2) && bits(3) < 0.7 * bits(2), "{said}");
+    for row in 0..4 {
+        let seconds = |stage: &str| json["rows"][row]["seconds"][stage].as_f64().unwrap();
+        let parts = ["decode", "source_radiance", "volume_pass", "view_pass"].map(seconds);
+        assert!(parts.iter().all(|s| *s > 0.0) && (parts.iter().sum::<f64>() - seconds("total")).abs() < 1e-9);
+        assert_eq!(json["rows"][row]["settings"]["scatter_step"], 8);
+    }
+    let reference = &json["references"][0];
+    assert!((reference["width"].as_i64(), reference["height"].as_i64()) == (Some(30), Some(40)));
+    let curve: Vec<f64> = (0..reference["curve"].as_array().unwrap().len())
+        .map(|i| reference["curve"][i]["relative_standard_error"].as_f64().unwrap())
+        .collect();
+    assert!(curve.len() >= 4 && curve[curve.len() - 1] < 0.7 * curve[0], "{curve:?}");
+    let page = std::fs::read_to_string(out.join("index.html")).unwrap();
+    assert!(page.ends_with("</html>\n") && !page.contains("http"));
+    // The reference, and four rows with their differences; one of the two plots of all rows, one of packs, two of dials.
+    assert_eq!((page.matches("<img").count(), page.matches("role=\"img\"").count()), (1 + 2 * 4, 4));
+}
+
+#[test]
+fn a_killed_sweep_continues_and_ends_with_the_same_rows() {
+    let folder = FOLDER.path();
+    let dials = ["--dial", "route=grid,centres", "--dial", "sh-order=1,2", "--vary", "albedo=0.5,0.9"];
+    answer(folder, &line("plume.smoke", "whole", &[&dials[..], &["--threads", "2"]].concat()));
+    let (names, expected) = rows(&folder.join("whole"));
+    assert_eq!(names[..6], ["scene", "albedo", "frame", "method", "dial", "value"]);
+    assert_eq!(expected.len(), 2 * 6);
+    assert!(expected.iter().all(|row| row[0] == "scene.toml" && row[2] == "8"));
+    assert_eq!((expected[0][1].as_str(), expected[11][1].as_str()), ("0.5", "0.9"));
+
+    let again = line("plume.smoke", "killed", &[&dials[..], &["--threads", "2"]].concat());
+    let mut child = command(folder, &again).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+    let journal = folder.join("killed/journal.jsonl");
+    let kept = || std::fs::read_to_string(&journal).map_or(0, |text| text.lines().count());
+    let start = Instant::now();
+    while kept() < 4 && start.elapsed() < Duration::from_secs(60) {
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    child.kill().unwrap();
+    child.wait().unwrap();
+    let before = std::fs::read_to_string(&journal).unwrap();
+    assert!(before.lines().count() >= 4 && !folder.join("killed/sweep.csv").exists(), "killed too early or too late");
+    answer(folder, &[&again[..], &["--resume"]].concat());
+    assert_eq!(rows(&folder.join("killed")), (names, expected));
+    // What was there is what is there: nothing was measured twice.
+    let after = std::fs::read_to_string(&journal).unwrap();
+    let whole = before.rfind('\n').map_or("", |end| &before[..end]);
+    assert!(whole.lines().skip(1).all(|line| after.contains(line)));
+    let csv = std::fs::read(folder.join("killed/sweep.csv")).unwrap();
+    answer(folder, &[&again[..], &["--resume"]].concat());
+    assert!(csv == std::fs::read(folder.join("killed/sweep.csv")).unwrap(), "a finished sweep only reads");
+}
+
+#[test]
+fn what_cannot_be_swept_is_refused_before_anything_is_written() {
+    let folder = FOLDER.path();
+    let refused = |input: &str, more: &[&str]| refusal(folder, &line(input, "nothing", more));
+    let message = refused("plume.smoke", &["--dial", "gaussians=10"]);
+    assert!(message.contains("plume.smoke: --dial gaussians") && message.contains("volumes"), "{message}");
+    assert!(refused("none.smoke", &[]).contains("none.smoke"));
+    assert!(refused("plume.smoke", &["--vary", "g=2"]).contains("medium.g"));
+    for (more, named) in [
+        (&["--dial", "shorder=1"][..], "sh-order"),
+        (&["--dial", "sh-order=9"], "--sh-order"),
+        (&["--dial", "sh-order=1", "--dial", "sh-order=2"], "given twice"),
+        (&["--dial", "scatter-order=6"], "--scatter-order"),
+        (&["--vary", "cutoff=0.1"], "sigma-t"),
+        (&["--set", "cutoff=0.1,0.2"], "one value"),
+        (&["--dial", "sh-order"], "NAME"),
+        (&["--resume", "--resume"], "--resume"),
+    ] {
+        let output = smoke_bake(folder, &line("plume.smoke", "nothing", more));
+        let message = text(&output.stderr);
+        assert!(output.status.code() == Some(2) && message.contains(named), "{more:?}: {message}");
+    }
+    assert!(!folder.join("nothing").exists());
+    let point = "\n[[light]]\nkind = \"point\"\nposition = [0, 0, 1]\nintensity = 10\n";
+    std::fs::write(folder.join("point.toml"), SCENE.to_owned() + point).unwrap();
+    let line = ["sweep", "plume.smoke", "--scene", "point.toml", "-o", "point", "--dial", "sh-order=2", "--width", "8"];
+    let output = smoke_bake(folder, &[&line[..], &["--reference-error", "50%", "--progress", "none"]].concat());
+    let message = text(&output.stderr);
+    assert!(output.status.code() == Some(1) && message.contains("nothing could be measured"), "{message}");
+    assert!(message.contains("sh-order 2: left out") && !folder.join("point/sweep.csv").exists());
+    std::fs::create_dir(folder.join("strange")).unwrap();
+    std::fs::write(folder.join("strange/index.html"), "the user's").unwrap();
+    for more in [&[][..], &["--resume"]] {
+        assert!(refusal(folder, &self::line("plume.smoke", "strange", more)).contains("other files"));
+    }
+    assert_eq!(std::fs::read_to_string(folder.join("strange/index.html")).unwrap(), "the user's");
+}
