@@ -16,6 +16,8 @@ use crate::renderer::{RenderError, RenderSettings};
 /// Factor by which a predicted error must stay below the one asked: predictions are right to a factor of 2, and mostly
 /// to this (see `docs/decisions/033-plan.md`).
 pub const MARGIN: f64 = 1.5;
+/// Rungs whose predicted seconds differ by less than this factor cost the same: the coarser one is taken.
+const SAME_SECONDS: f64 = 1.3;
 /// Error that the reference is traced to where none is asked: its own default.
 pub const REFERENCE_ERROR: f64 = 0.02;
 /// Least and most error that the reference is asked for.
@@ -180,6 +182,11 @@ fn for_error(candidates: &[Candidate], error: f64) -> (usize, String) {
     let by_seconds = |a: &usize, b: &usize| candidates[*a].seconds().total_cmp(&candidates[*b].seconds());
     let cheapest = (0..candidates.len()).filter(fast).filter(meets).min_by(by_seconds);
     if let Some(cheapest) = cheapest {
+        let most = candidates[cheapest].seconds() * SAME_SECONDS;
+        // The ladder goes from coarse to fine.
+        let mut as_cheap =
+            (0..candidates.len()).filter(fast).filter(meets).filter(|i| candidates[*i].seconds() <= most);
+        let cheapest = as_cheap.next().unwrap_or(cheapest);
         return (cheapest, format!("the cheapest predicted to meet {}", percent(error)));
     }
     let by_error = |a: &usize, b: &usize| candidates[*a].error().total_cmp(&candidates[*b].error());
@@ -256,6 +263,15 @@ mod tests {
         // Half the error costs four times the time.
         assert!((plan.candidate().seconds() - 200.0).abs() < 0.1);
         assert!(plan.why.contains("fine comes nearest with 1.0 %"), "{}", plan.why);
+    }
+
+    #[test]
+    fn of_rungs_that_cost_about_the_same_the_coarser_is_taken() {
+        let rung = |seconds: f64| {
+            let table = table(&[("sketch", 0.02, seconds), ("draft", 0.01, 0.5)]);
+            choose(&survey(1.0, 0.9, 0.0), Goal::Error(0.05), 1, &table).candidate().rung.name
+        };
+        assert_eq!((rung(0.6), rung(0.7)), ("sketch", "draft"));
     }
 
     #[test]
