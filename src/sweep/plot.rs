@@ -160,7 +160,7 @@ impl Plot {
             let _ = writeln!(out, "<path class=\"front\" d=\"{path}H{:.1}\"/>", left + across);
         }
         for curve in &self.curves {
-            curve.draw(&mut out, &at);
+            curve.draw(&mut out, &at, [top, top + up]);
         }
         for step in &self.front {
             let [x, y] = at(step[0], step[1]);
@@ -216,7 +216,8 @@ impl Plot {
 }
 
 impl Curve {
-    fn draw(&self, out: &mut String, at: &dyn Fn(f64, f64) -> [f64; 2]) {
+    /// Draws the curve with its values placed by `at`; standard errors end at the upper and the lower `edge`.
+    fn draw(&self, out: &mut String, at: &dyn Fn(f64, f64) -> [f64; 2], edge: [f64; 2]) {
         let _ = writeln!(out, "<g class=\"{}\">", self.style.class());
         let places: Vec<[f64; 2]> = self.marks.iter().map(|m| at(m.x, m.y)).collect();
         if self.style.joined && places.len() > 1 {
@@ -226,8 +227,8 @@ impl Curve {
         for (mark, [x, y]) in self.marks.iter().zip(places) {
             let _ = write!(out, "<g><title>{}</title>", escape(&mark.label));
             if mark.spread > 0.0 {
-                let ([_, low], [_, high]) =
-                    (at(mark.x, (mark.y - mark.spread).max(0.5 * mark.y)), at(mark.x, mark.y + mark.spread));
+                let end = |y: f64| at(mark.x, y)[1].clamp(edge[0], edge[1]);
+                let (low, high) = (end(mark.y - mark.spread), end(mark.y + mark.spread));
                 let _ = write!(out, "<path class=\"spread\" d=\"M{x:.1} {low:.1}V{high:.1}\"/>");
             }
             let _ = writeln!(out, "{}</g>", self.style.marker([x, y]));
@@ -409,7 +410,7 @@ mod tests {
 
     #[test]
     fn a_point_is_drawn_where_its_values_are() {
-        let mark = |x, y| Mark { x, y, spread: 0.0, label: String::new() };
+        let mark = |x, y| Mark { x, y, spread: 2.0, label: String::new() };
         let style = Style { number: Some(0), open: false, joined: true };
         let curve = Curve { name: "a".into(), style, marks: vec![mark(1.0, 10.0), mark(10.0, 1.0)] };
         let (x, y) = (Scale::Log(1.0, 10.0), Scale::Log(1.0, 10.0));
@@ -419,5 +420,8 @@ mod tests {
         let plot = Plot { title, size, x_label, y_label, x, y, curves: vec![curve], front: vec![] };
         let corners = format!("points=\"{left:.1},{top:.1} {:.1},{:.1}\"", left + 100.0, top + 100.0);
         assert!(plot.svg().contains(&corners), "{corners}\n{}", plot.svg());
+        // The standard error of the second point reaches below zero: its line ends at the edge of the plot.
+        let line = format!("V{:.1}\"", top + 100.0 * (1.0 - 3f64.log10()));
+        assert!(plot.svg().contains(&format!("M{:.1} {:.1}{line}", left + 100.0, top + 100.0)), "{}", plot.svg());
     }
 }
