@@ -296,7 +296,7 @@ mod tests {
             let bin = lit[(random.unit() * lit.len() as f32) as usize];
             let drawn = sky.sample(bin, [random.unit(), random.unit()]);
             let (seen, there) = sky.seen(drawn.direction);
-            let edge = |x: f32| x < 1e-3 || x > 1.0 - 1e-3;
+            let edge = |x: f32| !(1e-3..=1.0 - 1e-3).contains(&x);
             let [u, v] = sky.environment.place(drawn.direction);
             let (across, down) = ((u * 24.0 - 0.5).fract() as f32, (v * 12.0 + 0.5).fract() as f32);
             assert!(there == bin || edge(across) || edge(down), "{bin} {there} {u} {v}");

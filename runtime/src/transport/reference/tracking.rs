@@ -5,10 +5,12 @@
 //! bound)`. One draw decides for all channels: it is real with `P = sum w_c q_c / sum w_c`, w the weights so far, and the
 //! weights are multiplied by `q_c / P`, or by `(1 - q_c) / (1 - P)` if it is not. The sum of the weights never changes,
 //! so no weight grows, however different the channels are. In grey media weights do not change at all.
-//! *Transmittance* (residual ratio tracking: Novák et al. 2014): in a brick with the density between two bounds, the
-//! middle M of them attenuates exactly, and tentative collisions come at the rate of half their difference H:
-//! `exp(-int sigma_c M) * product of (1 - sigma_c / sigma_max (D - M) / H)`. Where the density is even it costs nothing
-//! and has no noise.
+//! *Transmittance* (residual ratio tracking: Novák et al. 2014): in a brick with the density between two bounds, a control
+//! C attenuates exactly, and tentative collisions come at the rate of the range H of what is left:
+//! `exp(-int sigma_c C) * product of (1 - sigma_c / sigma_max (D - C) / H)`. Where the density is even it costs nothing
+//! and has no noise. C is the middle of the bounds and H half their difference, which has the fewest collisions; but
+//! factors of up to 2 then multiply without bound, the second moment by up to `exp(depth of H)`. So where that depth
+//! is above [`RAGGED`], C is the lower bound and H the difference: no factor is above 1.
 //! *Column*: along a camera ray the density's integral is exact. In a cell it is a cubic of the distance, and two Gauss
 //! points integrate a cubic exactly; so the opacity of a ray has no noise, and the first collision can be placed evenly.
 //! Cost: flight and transmittance a look-up for each tentative collision; a column two for each cell with density.
@@ -23,6 +25,10 @@ use glam::{DAffine3, DVec3, Vec3};
 const FAINT: f32 = 3.0;
 /// The depth over which transmittance falls by four.
 const FAINTER: f32 = 1.386_294_4;
+/// Depth of half the bounds' difference along a piece of ray beyond which the lower bound is the control.
+const RAGGED: f32 = 1.0;
+/// Product of the factors below which it goes on by one chance in four, as at [`FAINT`].
+const FADED: f32 = 0.05;
 /// Half the distance of the two Gauss points, of a piece's length: 1 / (2 sqrt(3)).
 const GAUSS: f64 = 0.288_675_134_594_812_9;
 
@@ -187,8 +193,11 @@ impl<'a> Space<'a> {
         let (mut factor, mut depth, mut faint) = (Vec3::ONE, 0.0f32, FAINT);
         let mut remaining = random.exponential();
         self.majorants.walk(ray.origin, ray.direction, near, far.min(end), |from, to, [low, high]| {
-            let (middle, half) = (0.5 * (low + high), 0.5 * (high - low));
-            depth += extinction.max * middle * (to - from) as f32;
+            let length = (to - from) as f32;
+            let half = 0.5 * (high - low);
+            let even = extinction.max * half * length <= RAGGED;
+            let (control, range) = if even { (low + half, half) } else { (low, high - low) };
+            depth += extinction.max * control * length;
             if depth > faint {
                 if random.unit() < 0.75 {
                     factor = Vec3::ZERO;
@@ -197,7 +206,7 @@ impl<'a> Space<'a> {
                 factor *= 4.0;
                 faint = depth + FAINTER;
             }
-            let rate = extinction.max * half;
+            let rate = extinction.max * range;
             let mut t = from;
             loop {
                 let next = t + f64::from(remaining / rate);
@@ -208,8 +217,15 @@ impl<'a> Space<'a> {
                     return false;
                 }
                 t = next;
-                let off = ((self.density(ray.at(t)) - middle) / half).clamp(-1.0, 1.0);
+                let off = ((self.density(ray.at(t)) - control) / range).clamp(-1.0, 1.0);
                 factor *= Vec3::ONE - extinction.ratio * off;
+                if !even && factor.max_element() < FADED {
+                    if random.unit() < 0.75 {
+                        factor = Vec3::ZERO;
+                        return true;
+                    }
+                    factor *= 4.0;
+                }
                 remaining = random.exponential();
             }
         });
