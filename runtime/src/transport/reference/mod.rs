@@ -31,7 +31,7 @@ use crate::medium::field::DensityField;
 use crate::transport::medium::{MediumError, MediumParameters};
 use glam::Vec3;
 use lights::Lights;
-use path::{LONGEST, Scene};
+use path::Scene;
 use rayon::prelude::*;
 use tracking::{Column, Extinction, Space};
 
@@ -147,7 +147,7 @@ pub fn trace(
         lights: lights.0,
         backdrop: lights.1,
         camera: *camera,
-        orders: settings.orders.unwrap_or(LONGEST),
+        orders: settings.orders.unwrap_or(u32::MAX),
         seed: settings.seed,
     };
     let mut sums = vec![NOTHING; camera.width * camera.height];
