@@ -17,11 +17,11 @@
 mod guide;
 mod lights;
 mod majorant;
-pub mod path;
+mod path;
 mod phase;
 mod sampler;
 mod sky;
-pub mod tracking;
+mod tracking;
 
 use crate::backdrop::Sky;
 use crate::camera::Camera;

@@ -135,7 +135,7 @@ impl Scene<'_> {
                 let sigma = f64::from(self.sigma_t[c]);
                 (sigma * (-sigma * depth).exp()) as f32
             }));
-            let weight = if self.extinction_is_grey() {
+            let weight = if self.extinction.grey {
                 Vec3::splat(mean as f32)
             } else {
                 density * (whole as f32 / density.element_sum())
@@ -144,10 +144,6 @@ impl Scene<'_> {
             let path = Path { place, way, weight: weight * share, points, choice };
             self.follow(path, &mut random, sum);
         }
-    }
-
-    fn extinction_is_grey(&self) -> bool {
-        self.sigma_t[0] == self.sigma_t[1] && self.sigma_t[0] == self.sigma_t[2]
     }
 
     /// Adds what arrives by paths that go on from a first collision.

@@ -53,7 +53,7 @@ pub struct Extinction {
     /// The largest.
     pub max: f32,
     /// All channels equal.
-    grey: bool,
+    pub grey: bool,
 }
 
 impl Extinction {
