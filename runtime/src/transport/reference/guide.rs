@@ -5,7 +5,7 @@
 //! tiles by `flux (T + FLOOR mean T)`. Whatever the guess, the estimate stays unbiased, because the density that was
 //! drawn from is known exactly: chances are whole numbers of 1/65535, at least one for each tile with light (importance
 //! sampling by product; Clarberg and Akenine-Möller 2008 for surfaces). A vertex looks up a brick at a random place
-//! around it, so that the guess is smooth. Measured on the plume under a sunset: see `docs/decisions/040-reference.md`.
+//! around it, so that the guess is smooth. Where little of the sky gets through at all, it is looked at by chance only. Measured on the plume under a sunset: see `docs/decisions/040-reference.md`.
 //! Cost: bricks x tiles short walks, once; one binary search a direction.
 
 use super::majorant::Majorants;
@@ -16,14 +16,26 @@ use rayon::prelude::*;
 
 /// What a tile gets however little light the guess lets through, of the mean over all tiles.
 const FLOOR: f32 = 0.2;
+/// Least chance of a look.
+const SELDOM: f32 = 0.05;
+/// Mean guessed transmittance from which the sky is looked at every time.
+const FULL: f32 = 0.15;
 /// Whole numbers that the chances of a brick add up to.
 const WHOLE: u32 = 65_535;
 
+/// What a brick guesses of a sky.
+pub struct Outlook {
+    /// Sum of the chances up to and with each tile.
+    pub sums: [u16; BINS],
+    /// Chance with which the sky is looked at from here: where little of it gets through, seldom.
+    pub look: f32,
+}
+
 /// The tables of one sky.
 pub struct Guide {
-    /// Sum of the chances up to and with each tile, `[place][tile]`.
-    sums: Vec<[u16; BINS]>,
-    /// Where a brick's chances are in `sums`; bricks without density share the first.
+    /// Of the bricks with density, after that of all others.
+    outlooks: Vec<Outlook>,
+    /// Where a brick's is in `outlooks`.
     places: Vec<u32>,
     bricks: [usize; 3],
     per_brick: f64,
@@ -49,27 +61,33 @@ impl Guide {
                 (-sigma * depth).exp()
             };
             let through: Vec<f32> = ways.iter().map(through).collect();
-            chances(sky.parts(), |bin| through[bin])
+            outlook(sky.parts(), |bin| through[bin])
         };
-        let mut sums = vec![chances(sky.parts(), |_| 1.0)];
+        let mut outlooks = vec![outlook(sky.parts(), |_| 1.0)];
         let mut places = vec![0; middles.bounds.len()];
         for (place, &brick) in dense.iter().enumerate() {
             places[brick] = place as u32 + 1;
         }
-        sums.extend(dense.par_iter().map(of_brick).collect::<Vec<_>>());
-        Self { sums, places, bricks: middles.bricks, per_brick: 1.0 / middles.side }
+        outlooks.extend(dense.par_iter().map(of_brick).collect::<Vec<_>>());
+        Self { outlooks, places, bricks: middles.bricks, per_brick: 1.0 / middles.side }
     }
 
-    /// The chances that hold around `at` (node space), for `jitter` in [0, 1)^3.
+    /// The guess that holds around `at` (node space), for `jitter` in [0, 1)^3.
     #[inline(always)]
-    pub fn around(&self, at: DVec3, jitter: [f32; 3]) -> &[u16; BINS] {
+    pub fn around(&self, at: DVec3, jitter: [f32; 3]) -> &Outlook {
         let brick = |a: usize| {
             let b = at[a] * self.per_brick + f64::from(jitter[a]) - 0.5;
             (b as i64).clamp(0, self.bricks[a] as i64 - 1) as usize
         };
         let brick = brick(0) + self.bricks[0] * (brick(1) + self.bricks[1] * brick(2));
-        &self.sums[self.places[brick] as usize]
+        &self.outlooks[self.places[brick] as usize]
     }
+}
+
+/// The guess of a brick through whose smoke a part `through` of each tile's light comes.
+fn outlook(parts: &[f32; BINS], through: impl Fn(usize) -> f32) -> Outlook {
+    let mean: f32 = (0..BINS).map(|b| parts[b] * through(b)).sum();
+    Outlook { sums: chances(parts, through), look: (mean / FULL).clamp(SELDOM, 1.0) }
 }
 
 /// Sums of the chances of tiles drawn by `parts * (through + FLOOR * mean)`.
@@ -176,7 +194,7 @@ mod tests {
         let sky = Sky::new(&Environment::constant([1.0; 3])).unwrap();
         let space = Space::new(&field, 1.0);
         let guide = Guide::new(&space, &Majorants::middles(&field, 2), &sky, 1.0);
-        let sums = guide.around(DVec3::new(10.0, 8.5, 8.5), [0.5; 3]);
+        let sums = &guide.around(DVec3::new(10.0, 8.5, 8.5), [0.5; 3]).sums;
         let toward =
             |x: f32| -> f32 { (0..BINS).filter(|&b| sky.middle(b).x * x > 0.5).map(|b| chance(sums, b)).sum() };
         assert!(toward(1.0) > 3.0 * toward(-1.0), "{} {}", toward(1.0), toward(-1.0));

@@ -98,22 +98,31 @@ impl Lights {
     }
 
     /// Light from a direction drawn for `at` (node space) by `choice` and `u`, all in [0, 1), and `jitter` around it; there
-    /// must be some.
+    /// must be some. None where `look` in [0, 1) says that a sky of which little arrives is not looked at this time; when it
+    /// is, it counts for those.
     #[inline]
-    pub fn draw(&self, at: DVec3, jitter: [f32; 3], choice: f32, u: [f32; 2]) -> Drawn {
+    pub fn draw(&self, at: DVec3, jitter: [f32; 3], choice: f32, u: [f32; 2], look: f32) -> Option<Drawn> {
         let i = self.chances.partition_point(|&c| c <= choice).min(self.distant.len() - 1);
         let chance = self.chance(i);
-        match &self.distant[i] {
+        Some(match &self.distant[i] {
             Distant::Sky(sky, guide) => {
-                let (bin, tile, v) = guide::draw(guide.around(at, jitter), u[1]);
+                let outlook = guide.around(at, jitter);
+                if look >= outlook.look {
+                    return None;
+                }
+                let (bin, tile, v) = guide::draw(&outlook.sums, u[1]);
                 let drawn = sky.sample(bin, [u[0], v]);
                 let density = drawn.density * (chance * tile / sky.parts()[bin]);
-                Drawn { toward: drawn.direction, irradiance: Vec3::from_array(drawn.radiance) / density, density }
+                Drawn {
+                    toward: drawn.direction,
+                    irradiance: Vec3::from_array(drawn.radiance) / (density * outlook.look),
+                    density,
+                }
             }
             Distant::Sun { toward, irradiance } => {
                 Drawn { toward: *toward, irradiance: *irradiance / chance, density: f32::INFINITY }
             }
-        }
+        })
     }
 
     /// Radiance that a ray along `way` runs into, each sky by the share of it that is not [`Self::draw`]'s, when `way`
@@ -125,7 +134,7 @@ impl Lights {
             if let Distant::Sky(sky, guide) = distant {
                 let (seen, bin) = sky.seen(way);
                 if sky.parts()[bin] > 0.0 {
-                    let tile = guide::chance(guide.around(at, jitter), bin) / sky.parts()[bin];
+                    let tile = guide::chance(&guide.around(at, jitter).sums, bin) / sky.parts()[bin];
                     let drawn = seen.density * (self.chance(i) * tile);
                     sum += Vec3::from_array(seen.radiance) * share(density, drawn);
                 }

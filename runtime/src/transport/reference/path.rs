@@ -164,12 +164,14 @@ impl Scene<'_> {
             };
             if self.lights.has_distant() {
                 let choice = if collision == 1 { choice } else { random.unit() };
-                let drawn = self.lights.draw(place, jitter, choice, draw(2, random));
-                let scattered = phase::value(self.g, way.dot(drawn.toward));
-                let counted = if sky { share(drawn.density, scattered) } else { 1.0 };
-                let ray = self.space.ray(place, drawn.toward);
-                let through = self.space.transmittance(&ray, f64::INFINITY, &self.extinction, random);
-                sum.radiance += weight * drawn.irradiance * through * (scattered * counted);
+                let (u, look) = (draw(2, random), random.unit());
+                if let Some(drawn) = self.lights.draw(place, jitter, choice, u, look) {
+                    let scattered = phase::value(self.g, way.dot(drawn.toward));
+                    let counted = if sky { share(drawn.density, scattered) } else { 1.0 };
+                    let ray = self.space.ray(place, drawn.toward);
+                    let through = self.space.transmittance(&ray, f64::INFINITY, &self.extinction, random);
+                    sum.radiance += weight * drawn.irradiance * through * (scattered * counted);
+                }
             }
             let last = collision >= self.orders;
             if last && !sky {
