@@ -1,9 +1,8 @@
-//! The extremes of rendering, through the library as a user of it would: `docs/extremes.md` lists them all.
+//! The compensated routes and the dials of each: edits, threads, symmetries, and what they refuse.
 
+use crate::methods::{ball, camera, centres, frame, grey, lumps, sun, white};
 use glam::{DAffine3, DVec3, Vec3};
-use smoke_formats::gaussian::{Gaussian, UnitSpace};
-use smoke_formats::residual::ResidualCodes;
-use smoke_formats::volume::VoxelMask;
+use smoke_formats::gaussian::Gaussian;
 use smoke_runtime::camera::Camera;
 use smoke_runtime::film::Film;
 use smoke_runtime::light::{Environment, Light};
@@ -12,63 +11,20 @@ use smoke_runtime::medium::frame::Frame;
 use smoke_runtime::renderer::{RenderError, RenderSettings, Renderer, Route};
 use smoke_runtime::transport::ScatteringOrder;
 use smoke_runtime::transport::compensated::centres::exponential::Exponential;
-use smoke_runtime::transport::compensated::centres::route::{CentreSettings, MultipleScattering};
+use smoke_runtime::transport::compensated::centres::route::MultipleScattering;
 use smoke_runtime::transport::compensated::grid::route::GridSettings;
 use smoke_runtime::transport::medium::MediumParameters;
 
-/// A frame whose density is `density` of the voxel, all of it in the residual (with steps of 1/1000 of `unit`), at voxels
-/// of `voxel` world units around the world's origin.
-fn frame(dims: [u32; 3], voxel: f64, unit: f32, gaussians: &[Gaussian], density: impl Fn([u32; 3]) -> f32) -> Frame {
-    let count = dims.iter().product::<u32>() as usize;
-    let mut support = VoxelMask::new(count);
-    let mut codes = Vec::new();
-    for v in 0..count as u32 {
-        let at = [v % dims[0], v / dims[0] % dims[1], v / dims[0] / dims[1]];
-        let code = (density(at) * 1000.0).round() as i32;
-        if code > 0 || !gaussians.is_empty() {
-            support.set(v as usize);
-            codes.push(code);
-        }
-    }
-    let residual = ResidualCodes { origin: [0; 3], dims, support, codes };
-    let centre = DVec3::from_array(dims.map(|d| 0.5 * f64::from(d - 1))) * voxel;
-    let map = DAffine3::from_scale_rotation_translation(DVec3::splat(voxel), glam::DQuat::IDENTITY, -centre);
-    Frame::decode(gaussians.to_vec(), &residual, unit / 1000.0, UnitSpace::of_box([0; 3], dims), map)
-}
-
-/// A soft ball, 20 voxels across, radius about 0.35 of the box.
-fn ball(voxel: f64, unit: f32) -> Frame {
-    frame([20; 3], voxel, unit, &[], |at| {
-        let p = Vec3::from_array(at.map(|i| i as f32)) - 9.5;
-        (-(p.length() / 6.0).powi(4)).exp()
-    })
-}
-
-fn grey(sigma_t: f32, albedo: f32, g: f32) -> MediumParameters {
-    MediumParameters { sigma_t: [sigma_t; 3], albedo: [albedo; 3], g }
-}
-
-fn white() -> Vec<Light> {
-    vec![Light::Environment(Environment::constant([1.0; 3]))]
-}
-
-fn sun(toward: Vec3) -> Vec<Light> {
-    vec![Light::Directional { toward, irradiance: [3.0, 2.0, 1.0] }]
-}
-
-fn camera(distance: f64) -> Camera {
-    Camera::look_at(DVec3::new(0.3, -1.0, 0.2) * distance, DVec3::ZERO, DVec3::Z, 40.0, 24, 18)
-}
-
-fn render(settings: RenderSettings, frame: Frame, medium: MediumParameters, lights: Vec<Light>, from: &Camera) -> Film {
+pub fn render(
+    settings: RenderSettings,
+    frame: Frame,
+    medium: MediumParameters,
+    lights: Vec<Light>,
+    from: &Camera,
+) -> Film {
     let mut renderer = Renderer::new(settings, medium, lights).unwrap();
     renderer.set_frame(frame).unwrap();
     renderer.render(from).unwrap().0
-}
-
-fn centres(exponential: Exponential, multiple: MultipleScattering) -> RenderSettings {
-    let route = Route::Centres(CentreSettings { exponential, multiple, ..CentreSettings::default() });
-    RenderSettings { route, ..RenderSettings::default() }
 }
 
 fn all_routes() -> Vec<RenderSettings> {
@@ -80,34 +36,11 @@ fn all_routes() -> Vec<RenderSettings> {
     ]
 }
 
-/// Two Gaussians of which the ball is the sum, roughly; the residual is zero.
-fn lumps() -> Vec<Gaussian> {
-    vec![
-        Gaussian { center: [0.4, 0.5, 0.5], radius: 0.2, weight: 0.8 },
-        Gaussian { center: [0.62, 0.52, 0.45], radius: 0.15, weight: 0.5 },
-    ]
-}
-
 fn sound(film: &Film, brightest: f32, what: &str) {
     for pixel in &film.pixels {
         let good = pixel.radiance.iter().all(|r| (0.0..=brightest).contains(r));
         let alpha = (-1e-6..=1.0).contains(&pixel.alpha());
         assert!(good && alpha && !pixel.depth.is_nan(), "{what}: {pixel:?}");
-    }
-}
-
-#[test]
-fn a_camera_inside_the_smoke_sees_it_all_round_and_from_the_eye_on() {
-    for settings in all_routes() {
-        for forward in [DVec3::X, DVec3::NEG_X, DVec3::Y, DVec3::NEG_Z] {
-            let eye = DVec3::new(0.05, -0.03, 0.02);
-            let inside = Camera::look_at(eye, eye + forward, DVec3::new(0.3, 0.5, 0.7), 70.0, 12, 12);
-            let film =
-                render(settings, frame([20; 3], 0.1, 1.0, &lumps(), |_| 0.0), grey(4.0, 0.9, 0.3), white(), &inside);
-            sound(&film, 1.1, "inside");
-            // Density begins at the eye: the first sample is half a step away, and a step is at most a voxel of 0.1.
-            assert!(film.pixels.iter().all(|p| p.alpha() > 0.2 && p.depth <= 0.0501), "{forward}");
-        }
     }
 }
 
@@ -155,26 +88,6 @@ fn units_from_a_millionth_to_a_million_give_the_same_image_when_extinction_scale
                 assert!(a.depth == b.depth || (depth / f64::from(b.depth) - 1.0).abs() < 1e-5, "{voxel} {depth} {b:?}");
             }
         }
-    }
-}
-
-#[test]
-fn a_slab_of_constant_density_scatters_once_by_its_closed_form() {
-    // Light from above, seen from above: L = albedo E / (4 pi) (1 - exp(-2 tau)) / 2.
-    let settings = RenderSettings { scattering: ScatteringOrder::Single, ..RenderSettings::default() };
-    for tau in [1e-3f32, 0.1, 1.0] {
-        let slab = frame([40, 40, 10], 0.1, 1.0, &[], |_| 1.0);
-        let above = Camera::look_at(DVec3::new(0.0, 0.0, 50.0), DVec3::ZERO, DVec3::Y, 0.2, 3, 3);
-        let film = render(settings, slab, grey(tau, 0.8, 0.0), sun(Vec3::Z), &above);
-        let expected = 0.8 / (4.0 * std::f32::consts::PI) * 0.5 * -(-2.0 * tau).exp_m1();
-        for (c, irradiance) in [3.0, 2.0, 1.0].into_iter().enumerate() {
-            let found = film.pixels[4].radiance[c];
-            // J is read between nodes as linear where it falls as e^-x, x = tau / 10: x^2 / 12 on the mean. The column is
-            // summed by midpoints with kinks at the ramps: at most 1/16 voxel of 10 in the worst case, half of it at
-            // each end. And 2^-24 of rounding in 1 - T at tau = 1e-3.
-            assert!((found / (expected * irradiance) - 1.0).abs() < 7e-3, "{tau}: {found} {}", expected * irradiance);
-        }
-        assert!((film.pixels[4].transmittance[0] - 1.0 - (-tau).exp_m1()).abs() < 1e-2 * tau);
     }
 }
 
@@ -233,38 +146,6 @@ fn one_gaussian_and_coincident_gaussians_are_finite_and_agree() {
                 for (a, b) in single.pixels.iter().zip(&twice.pixels) {
                     assert!((a.radiance[1] - b.radiance[1]).abs() < 1e-3 * a.radiance[1].max(0.05), "{a:?} {b:?}");
                 }
-            }
-        }
-    }
-}
-
-#[test]
-fn an_optical_depth_of_a_million_is_neither_black_nor_out_of_range() {
-    for settings in all_routes() {
-        let dense = || frame([20; 3], 0.1, 1.0, &lumps(), |_| 0.0);
-        let film = render(settings, dense(), grey(5e5, 0.9, 0.5), white(), &camera(4.0));
-        sound(&film, 1.1, "deep");
-        let covered: Vec<f32> = film.pixels.iter().filter(|p| p.alpha() > 0.999).map(|p| p.radiance[1]).collect();
-        assert!(covered.len() > 30);
-        if matches!(settings.route, Route::Grid(_)) {
-            assert!(covered.iter().sum::<f32>() / covered.len() as f32 > 0.05, "{settings:?} is black");
-        }
-    }
-}
-
-#[test]
-fn the_furnace_holds_through_the_renderer_with_a_visible_sky_and_any_peak() {
-    for g in [0.0, 0.6, 0.65, 0.9, 0.99, -0.99] {
-        for visible in [false, true] {
-            let Light::Environment(mut sky) = white().remove(0) else { unreachable!() };
-            sky.visible = visible;
-            let grid = GridSettings { single_step: 1, multiple_step: 1, multiple_order: 4, ..GridSettings::default() };
-            let settings = RenderSettings { route: Route::Grid(grid), ..RenderSettings::default() };
-            let film = render(settings, ball(0.1, 1.0), grey(8.0, 1.0, g), vec![Light::Environment(sky)], &camera(4.0));
-            for pixel in film.pixels.iter().filter(|p| visible || p.alpha() > 0.01) {
-                let expected = if visible { 1.0 } else { pixel.alpha() };
-                // As in the grid route's own furnace: two quadratures of the sphere, and J inside a cell.
-                assert!((pixel.radiance[1] / expected - 1.0).abs() < 0.025, "g {g} visible {visible}: {pixel:?}");
             }
         }
     }
