@@ -150,3 +150,59 @@ fn what_cannot_be_swept_is_refused_before_anything_is_written() {
     }
     assert_eq!(std::fs::read_to_string(folder.join("strange/index.html")).unwrap(), "the user's");
 }
+
+#[test]
+fn a_sweep_of_rungs_writes_rows_that_the_plans_table_takes() {
+    let folder = FOLDER.path();
+    // A grey medium under light that is not seen; two values on every axis, as a table wants them.
+    let more = ["--vary", "sigma-t=0.5,8", "--vary", "g=0,0.5", "--vary", "albedo=0.5,0.9", "--threads", "2"];
+    let rungs = ["--ladder=sketch,single-draft,centres,reference", "--width", "12"];
+    let line = line("plume.smoke", "rungs", &[&rungs[..], &more].concat());
+    answer(folder, &line);
+    let text = std::fs::read_to_string(folder.join("rungs/measured.csv")).unwrap();
+    let table = smoke_runtime::plan::table::Table::parse(&text).unwrap();
+    let rows = smoke_runtime::plan::table::rows(&text).unwrap();
+    assert_eq!(rows.len(), 4 * 8);
+    let order: Vec<&str> = rows.iter().step_by(8).map(|row| row.rung.as_str()).collect();
+    assert_eq!(order, ["single-draft", "sketch", "centres", "reference"]);
+    assert!(rows.iter().all(|row| row.scene == "scene 8" && row.threads == 2 && row.seconds[2] > 0.0));
+    // The rows of sweep.csv are the same measurements; the reference's is its noise, below the 5 % asked, over fewer
+    // pixels than the whole image.
+    let (names, swept) = self::rows(&folder.join("rungs"));
+    let at = |name: &str| names.iter().position(|n| n == name).unwrap();
+    assert_eq!(swept.len(), 3 * 8);
+    for row in rows.iter().filter(|row| row.rung != "reference") {
+        let same = |csv: &&Vec<String>| {
+            let number = |name: &str| csv[at(name)].parse::<f64>().unwrap();
+            csv[at("value")] == row.rung
+                && number("g") == row.g
+                && number("albedo") == row.albedo
+                && (number("sigma-t") > 1.0) == (row.depth > 1.0)
+        };
+        let error: f64 = swept.iter().find(same).unwrap()[at("relative_rmse")].parse().unwrap();
+        assert!((error - row.error).abs() <= 1e-4 * error, "{}: {error} {}", row.rung, row.error);
+    }
+    let found = |rung: &str| table.error_at(rung, 1.0, 0.0, 0.9, 0.0).unwrap();
+    assert!(found("reference") < 0.06 && found("single-draft") > found("reference"));
+    answer(folder, &[&line[..], &["--resume"]].concat());
+    assert!(text == std::fs::read_to_string(folder.join("rungs/measured.csv")).unwrap(), "a finished sweep only reads");
+
+    let changed =
+        |name: &str, from: &str, to: &str| std::fs::write(folder.join(name), SCENE.replace(from, to)).unwrap();
+    changed("seen.toml", "color =", "visible = true\ncolor =");
+    changed("coloured.toml", "albedo = 0.9", "albedo = [0.9, 0.9, 0.8]");
+    // What has no place in the table is refused before anything is written.
+    for (more, named) in [
+        (&["--ladder", "--set", "sh-order=2"][..], "--set sh-order does not apply to --ladder"),
+        (&["--ladder", "--vary", "order=single"], "--vary order does not apply to --ladder"),
+        (&["--ladder", "--scene", "seen.toml"], "seen.toml: light: found a visible sky"),
+        (&["--ladder", "--scene", "coloured.toml"], "coloured.toml: medium: found a coloured one"),
+        (&["--ladder", "--dial", "sh-order=2"], "--dial"),
+        (&["--ladder=finest"], "finest"),
+    ] {
+        let output = smoke_bake(folder, &self::line("plume.smoke", "none", more));
+        assert_ne!(output.status.code(), Some(0), "{more:?}");
+        assert!(common::text(&output.stderr).contains(named), "{more:?}: {}", common::text(&output.stderr));
+        assert!(!folder.join("none").exists());
+    }
+}

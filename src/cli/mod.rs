@@ -13,7 +13,7 @@ pub use bake::{AtRest, BakeArgs, GaussianCount, ResidualAddress, TeleportRule};
 pub use compare::{CompareArgs, Picture};
 pub use plan::PlanArgs;
 pub use render::{Detail, ExponentialChoice, MethodChoice, MultipleChoice, RenderArgs, RouteChoice, ScatteringOrders};
-pub use sweep::{Assignment, SweepArgs};
+pub use sweep::{ALL_RUNGS, Assignment, SweepArgs};
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use smoke_formats::sequence::FrameSelection;

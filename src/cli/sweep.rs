@@ -2,7 +2,9 @@
 
 use super::{ProgressMode, ratio, threads};
 use clap::Args;
+use clap::builder::PossibleValuesParser;
 use smoke_formats::sequence::FrameSelection;
+use smoke_runtime::plan::ladder::ladder;
 use std::path::PathBuf;
 
 /// An option of `bake` or `render` by its long name, and values for it.
@@ -31,6 +33,11 @@ pub struct SweepArgs {
     /// Every combination of the dials' values, instead of one dial at a time around the defaults.
     #[arg(long)]
     pub grid: bool,
+    /// Measure the plan's rungs, each with all its dials, instead of dials: all of them, or those named; writes
+    /// measured.csv too, in the form of the plan's table.
+    #[arg(long, value_name = "RUNG,RUNG", num_args = 0.., require_equals = true, value_delimiter = ',',
+          default_missing_value = ALL_RUNGS, value_parser = rungs(), conflicts_with_all = ["dial", "grid"])]
+    pub ladder: Vec<String>,
     /// An option of `render` or `bake` that holds throughout, in place of its default.
     #[arg(long, value_name = "NAME=VALUE", value_parser = assignment)]
     pub set: Vec<Assignment>,
@@ -66,6 +73,14 @@ pub struct SweepArgs {
     pub json: bool,
 }
 
+/// What `--ladder` names them all by.
+pub const ALL_RUNGS: &str = "all";
+
+/// Names that `--ladder` takes.
+fn rungs() -> PossibleValuesParser {
+    [ALL_RUNGS].into_iter().chain(ladder().map(|rung| rung.name)).collect::<Vec<_>>().into()
+}
+
 /// `NAME=V1,V2`.
 fn assignment(text: &str) -> Result<Assignment, String> {
     let (name, values) = text.split_once('=').ok_or("expected NAME=VALUE, or NAME=VALUE,VALUE")?;
@@ -91,6 +106,11 @@ mod tests {
         assert_eq!((args.scene.len(), args.vary[0].values[0].as_str(), args.repeat), (2, "-0.5", 3));
         assert!((args.reference_error - 0.007).abs() < 1e-15);
         assert!(parse::<SweepArgs>(&[&line[..], &["--reference-error", "0"]].concat()).is_err());
+        let ladder = |more: &[&str]| parse::<SweepArgs>(&[&line[..6], &["out"], more].concat()).map(|a| a.ladder);
+        assert_eq!(ladder(&["--ladder"]).unwrap(), [ALL_RUNGS]);
+        assert_eq!(ladder(&["--ladder=fine,reference", "--json"]).unwrap(), ["fine", "reference"]);
+        assert!(ladder(&["--ladder=finest"]).is_err() && ladder(&["--ladder", "--grid"]).is_err());
+        assert!(args.ladder.is_empty());
         for bad in ["sh-order", "=1", "sh-order=", "sh-order=1,,2"] {
             assert!(parse::<SweepArgs>(&[&line[..], &["--dial", bad]].concat()).is_err(), "{bad}");
         }

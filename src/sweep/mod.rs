@@ -4,6 +4,7 @@
 //! |---|---|
 //! | `options` | options of `render` and `bake` by name, parsed as the command line parses them |
 //! | `points` | which settings are measured |
+//! | `rungs` | the plan's rungs as points, and the plan's table |
 //! | `setting` | scenes with the values of the axes |
 //! | `source` | the true density, and the packs |
 //! | `measure` | a reference; a point against it |
@@ -19,6 +20,7 @@ mod options;
 mod page;
 mod plot;
 mod points;
+mod rungs;
 mod setting;
 mod source;
 mod store;
@@ -32,12 +34,14 @@ use measure::{Distance, FULL_COLOUR};
 use options::{Options, Owner};
 use points::Point;
 use rayon::ThreadPool;
+use rungs::Rows;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use setting::Setting;
 use smoke_formats::pack::Pack;
 use smoke_formats::{atomic, image};
 use smoke_runtime::film::Film;
+use smoke_runtime::plan::Survey;
 use source::Source;
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
@@ -62,11 +66,18 @@ pub fn run(args: &SweepArgs) -> Result<(), Failure> {
     let base = base(args)?;
     let settings = setting::all(args)?;
     let source = Source::open(args, &base)?;
-    let dials = if args.dial.is_empty() { points::usual(source.density_max()) } else { args.dial.clone() };
     let Some(first) = settings.first() else { return Err(Failure::work("no scene")) };
-    let points = points::expand(&base, &dials, args.grid, &first.stage)?;
+    let dials = match (args.ladder.is_empty(), args.dial.is_empty()) {
+        (false, _) => Vec::new(),
+        (true, true) => points::usual(source.density_max()),
+        (true, false) => args.dial.clone(),
+    };
+    let points = match args.ladder.is_empty() {
+        true => points::expand(&base, &dials, args.grid, &first.stage)?,
+        false => rungs::points(args, &base, &settings)?,
+    };
     let store = Store::open(&args.output, args.resume)?;
-    let mut sweep = Sweep { args, source, points, store, pools: Pools::default() };
+    let mut sweep = Sweep { args, source, points, store, pools: Pools::default(), rungs: Rows::default() };
     let groups = sweep.measure(&settings)?;
     if groups.iter().all(|g| g.rows.is_empty()) {
         let why = groups.iter().flat_map(|g| &g.refused).next().map_or("no points", |[_, _, why]| why);
@@ -74,7 +85,8 @@ pub fn run(args: &SweepArgs) -> Result<(), Failure> {
     }
     let names: Vec<Value> = dials.iter().map(|d| json!({ "name": d.name, "values": d.values })).collect();
     let asked = json!({
-        "input": args.input, "scenes": args.scene, "frames": sweep.source.frames(), "dials": names, "grid": args.grid,
+        "input": args.input, "scenes": args.scene, "frames": sweep.source.frames(),
+        "dials": names, "grid": args.grid, "ladder": args.ladder,
         "set": base.iter().map(|(name, value)| json!({ "name": name, "value": value })).collect::<Vec<_>>(),
         "vary": args.vary.iter().map(|d| json!({ "name": d.name, "values": d.values })).collect::<Vec<_>>(),
         "reference_error": args.reference_error, "repeat": args.repeat,
@@ -125,6 +137,8 @@ struct Sweep<'a> {
     points: Vec<Point>,
     store: Store,
     pools: Pools,
+    /// Of the rungs, for the plan's table.
+    rungs: Rows,
 }
 
 impl Sweep<'_> {
@@ -173,6 +187,18 @@ impl Sweep<'_> {
         };
         let (key, image, reference) = self.reference(setting, i, progress)?;
         progress.advance(REFERENCE_STEPS);
+        // All rungs have the same pack.
+        let of_rungs = self.points.iter().find(|point| point.rung.is_some());
+        let survey = of_rungs
+            .and_then(|point| packs.get(&point.options.of(Owner::Bake)))
+            .map(|pack| rungs::survey(pack, self.source.position(i), setting))
+            .transpose()?;
+        // As the plan's table names it: no folders, and where it is among the axes the row says itself.
+        let name = format!("{} {}", setting.scene.file_stem().unwrap_or_default().display(), place.frame);
+        if let Some(survey) = &survey {
+            let threads = self.pools.get(self.args.threads.unwrap_or(0))?.current_num_threads();
+            self.rungs.push_reference(self.args, &name, survey, &reference, threads);
+        }
         let (mut rows, mut refused) = (Vec::new(), Vec::new());
         for index in 0..self.points.len() {
             let point = self.points[index].clone();
@@ -181,16 +207,21 @@ impl Sweep<'_> {
             progress.describe(format!("frame {}, {turned}", place.frame));
             let bake = point.options.of(Owner::Bake);
             let Some(pack) = packs.get(&bake) else { continue };
-            let (picture, outcome) = self.point(setting, i, pack, &point, (&key, &image))?;
+            let (picture, outcome) = self.point(setting, i, pack, (&point, survey.as_ref()), (&key, &image))?;
             match outcome {
-                Outcome::Measured(figures) => rows.push(Row {
-                    place: place.clone(),
-                    dial: point.dial,
-                    value: point.value,
-                    bake: words(&bake),
-                    figures: *figures,
-                    picture,
-                }),
+                Outcome::Measured(figures) => {
+                    if let Some(survey) = &survey {
+                        self.rungs.push(&name, survey, &point.value, &figures);
+                    }
+                    rows.push(Row {
+                        place: place.clone(),
+                        dial: point.dial,
+                        value: point.value,
+                        bake: words(&bake),
+                        figures: *figures,
+                        picture,
+                    });
+                }
                 Outcome::Refused(why) => {
                     eprintln!("smoke-bake: note: frame {}, {turned}: left out: {why}", place.frame);
                     refused.push([point.dial, point.value, why]);
@@ -233,12 +264,13 @@ impl Sweep<'_> {
         setting: &Setting,
         i: usize,
         pack: &Pack,
-        point: &Point,
+        (point, survey): (&Point, Option<&Survey>),
         (reference, truth): (&Key, &ReferenceImage),
     ) -> Result<(Key, Outcome), Failure> {
         let asked: RenderArgs = setting.options(&point.options).render()?;
         // The Debug form has every option: whatever is not the same in it is another point.
-        let (made_by, repeat) = (format!("{asked:?}"), self.args.repeat.to_string());
+        let dials = survey.and_then(|survey| point.rung?.settings_for(survey));
+        let (made_by, repeat) = (format!("{asked:?} {dials:?}"), self.args.repeat.to_string());
         let key = Key::of(&["point", reference.as_str(), &format!("{:016x}", pack.checksum()), &made_by, &repeat]);
         if let Some(outcome) = self.store.find(&key) {
             return Ok((key, outcome));
@@ -246,7 +278,10 @@ impl Sweep<'_> {
         let (position, repeat) = (self.source.position(i), self.args.repeat);
         let pool = self.pools.get(asked.threads.unwrap_or(0))?;
         let threads = pool.current_num_threads();
-        let rendered = match Method::choose(&asked, &setting.stage).map_err(points::conflict) {
+        let rendered = match dials
+            .map_or_else(|| Method::choose(&asked, &setting.stage), |dials| Ok(Method::Compensated(dials)))
+            .map_err(points::conflict)
+        {
             Ok(method) => pool
                 .install(|| measure::render(pack, position, (&method, asked.detail), &setting.stage, repeat))?
                 .map(|rendered| (method, rendered)),
@@ -306,6 +341,9 @@ impl Sweep<'_> {
         let text = serde_json::to_string_pretty(&document).map_err(|e| Failure::work(format!("sweep.json: {e}")))?;
         write("sweep.csv", &table::csv(groups))?;
         write("sweep.json", &(text + "\n"))?;
+        if !self.args.ladder.is_empty() {
+            write(store::MEASURED, &self.rungs.csv())?;
+        }
         write("index.html", &page::html(groups, &self.args.input, &self.store)?)?;
         if self.args.json {
             return answer::json(&document);

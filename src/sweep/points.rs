@@ -11,6 +11,7 @@ use crate::failure::Failure;
 use crate::method::Method;
 use crate::staging::Stage;
 use clap::error::ErrorKind;
+use smoke_runtime::plan::ladder::Rung;
 
 /// The options whose values are the methods.
 const METHODS: [&str; 2] = ["method", "route"];
@@ -22,14 +23,16 @@ pub const DEFAULTS: &str = "defaults";
 pub const COMBINED: &str = "combined";
 
 /// One point: settings, and which dial was turned to get there.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Point {
-    /// The dial: an option's name, [`DEFAULTS`] or [`COMBINED`].
+    /// The dial: an option's name, [`DEFAULTS`], [`COMBINED`] or [`super::rungs::DIAL`].
     pub dial: String,
     /// Its value as it was given; all values of a combined point; empty at the defaults.
     pub value: String,
     /// All options that are not at their default.
     pub options: Options,
+    /// The rung of the plan whose dials it has, in place of those of the options.
+    pub rung: Option<Rung>,
 }
 
 /// The points of a sweep around `base`.
@@ -42,7 +45,7 @@ pub fn expand(base: &Options, dials: &[Assignment], product: bool, stage: &Stage
 
 fn star(base: &Options, dials: &[Assignment], stage: &Stage) -> Result<Vec<Point>, Failure> {
     let check = |options: &Options| check(options, stage);
-    let middle = |options| Point { dial: DEFAULTS.into(), value: String::new(), options };
+    let middle = |options| Point { dial: DEFAULTS.into(), value: String::new(), options, rung: None };
     let (methods, dials): (Vec<_>, Vec<_>) = dials.iter().cloned().partition(|d| METHODS.contains(&d.name.as_str()));
     let mut middles = combine(base, &methods, stage)?;
     middles.iter_mut().for_each(|point| *point = middle(point.options.clone()));
@@ -54,6 +57,7 @@ fn star(base: &Options, dials: &[Assignment], stage: &Stage) -> Result<Vec<Point
                 dial: dial.name.clone(),
                 value: value.clone(),
                 options: from.options.with(&dial.name, value),
+                rung: None,
             };
             let before = arms.len();
             let mut refused = None;
@@ -102,7 +106,7 @@ fn combine(base: &Options, dials: &[Assignment], stage: &Stage) -> Result<Vec<Po
     let mut refused = None;
     for (words, options) in all {
         match check(&options, stage) {
-            Ok(()) => points.push(Point { dial: COMBINED.into(), value: words.join(" "), options }),
+            Ok(()) => points.push(Point { dial: COMBINED.into(), value: words.join(" "), options, rung: None }),
             Err(failure) => refused = refused.or(Some(conflict(failure)?)),
         }
     }

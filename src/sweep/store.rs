@@ -3,6 +3,7 @@
 //! | in DIR | what |
 //! |---|---|
 //! | `sweep.csv`, `sweep.json`, `index.html` | the answer, each whole |
+//! | `measured.csv` | with `--ladder`, the rows of the plan's table |
 //! | `journal.jsonl` | a line for each finished measurement: the [`Key`] of what made it, and what was measured |
 //! | `references/KEY.exr` | a reference: R, G, B, A, and `standard_error.R`, `.G`, `.B`, as `compare` takes it |
 //! | `pictures/KEY.png`, `KEY.difference.png` | thumbnails |
@@ -31,8 +32,10 @@ const HEAD: &str = "{\"smoke-bake\":\"sweep\",\"version\":1}";
 const MAX_BYTES: u64 = 1 << 30;
 /// Folders that a sweep fills.
 const FOLDERS: [&str; 3] = ["references", "pictures", "packs"];
+/// The rows of the plan's table, of a sweep of rungs.
+pub const MEASURED: &str = "measured.csv";
 /// Answers of a sweep.
-const ANSWERS: [&str; 3] = ["sweep.csv", "sweep.json", "index.html"];
+const ANSWERS: [&str; 4] = ["sweep.csv", "sweep.json", "index.html", MEASURED];
 /// Channels of a reference.
 const CHANNELS: [&str; 7] = ["R", "G", "B", "A", "standard_error.R", "standard_error.G", "standard_error.B"];
 

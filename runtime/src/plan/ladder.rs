@@ -1,5 +1,5 @@
 //! Named settings of the methods, from the cheapest to the finest. Their errors and seconds are in the measured table,
-//! by name: a rung that changes needs measuring again (`smoke-bake sweep --ladder`).
+//! by name: a rung that changes needs measuring again (`smoke-bake sweep --ladder=NAME`).
 
 use super::Survey;
 use crate::march::MarchSettings;

@@ -1,7 +1,8 @@
 //! Measured errors and seconds of the rungs over scenes, and what they predict for another scene.
 //!
-//! `measured.csv` is made by `smoke-bake sweep` (see its `--ladder`): a row is one rung on one scene, and a rung's scenes are
-//! a full product of four axes: optical depth (95th percentile), |g|, albedo and directionality of the light. In
+//! `measured.csv` is made by `smoke-bake sweep --ladder`, which writes a file of that name in this form; the lines that made
+//! it are in `docs/decisions/033-plan.md`. A row is one rung on one scene, and a rung's scenes are a full product of four
+//! axes: optical depth (95th percentile), |g|, albedo and directionality of the light. In
 //! `(ln depth, |g|, sqrt(1 - albedo), directionality)` the logarithms of the error and of the seconds per unit of work are
 //! interpolated linearly between the measured ones, and held constant beyond the outermost.
 //! `sqrt(1 - albedo)` because a thick medium's light falls off by it (diffusion: the root of `3 (1 - albedo)`).
