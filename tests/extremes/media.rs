@@ -21,7 +21,9 @@ fn white_and_sun() -> Vec<Light> {
 fn model_error(method: Method, sigma_t: f32) -> f64 {
     match method {
         Method::Reference => 0.0,
-        Method::Grid | Method::HalfResolution | Method::GridSingle => 0.08,
+        Method::Grid | Method::HalfResolution => 0.08,
+        // At g = 0.99 the peak is windowed to four bands: 8.6 % against 64 passes.
+        Method::GridSingle => 0.10,
         _ if sigma_t <= 0.1 => 0.05,
         Method::Centres => {
             if sigma_t < 5.0 {
@@ -71,7 +73,8 @@ fn thin_smoke_is_lit_in_proportion_to_its_depth() {
 fn any_depth_is_as_bright_as_the_reference_says_within_each_methods_own_error() {
     for depth in [1e-6, 1e-3, 0.1, 1.0, 10.0] {
         let scene = Scene::lumps(coloured(depth), white_and_sun());
-        let (all, single) = (scene.reference(None, 16), scene.reference(Some(1), 16));
+        // Of one order at g = 0.99 a pixel meets few paths that count; their spread must be known.
+        let (all, single) = (scene.reference(None, 16), scene.reference(Some(1), 64));
         for method in ALL.into_iter().filter(|m| *m != Method::Reference) {
             let film = method.served(&scene);
             let truth = if method.is_single() { &single } else { &all };
@@ -188,7 +191,8 @@ fn any_g_is_as_bright_as_the_reference_says_within_each_methods_own_error() {
         let medium = MediumParameters { g, ..coloured(3.0) };
         // A white sky has no direction to be lost in four bands; a sun behind a peak has.
         let scene = Scene::lumps(medium, white());
-        let (all, single) = (scene.reference(None, 16), scene.reference(Some(1), 16));
+        // Of one order at g = 0.99 a pixel meets few paths that count; their spread must be known.
+        let (all, single) = (scene.reference(None, 16), scene.reference(Some(1), 64));
         for method in ALL.into_iter().filter(|m| *m != Method::Reference) {
             let truth = if method.is_single() { &single } else { &all };
             let film = method.served(&scene);
