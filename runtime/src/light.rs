@@ -110,9 +110,16 @@ impl Environment {
         cells.iter().map(|s| [0, 1, 2].map(|c| if s[3] > 0.0 { s[c] / s[3] } else { 0.0 })).collect()
     }
 
-    /// The pooled texels as small beams: exact flux, exact mean direction.
-    fn pooled(&self) -> Vec<Texel> {
-        let pool = self.width.div_ceil(POOLED_WIDTH).max(1);
+    /// The sky as small beams: unit directions to it with what they bring, radiance times solid angle. Texels are pooled
+    /// to at most `across` columns; then each beam has the exact flux and mean direction of its texels.
+    pub fn texels(&self, across: usize) -> Vec<(DVec3, [f64; 3])> {
+        let lit = self.pooled(across).into_iter().filter(|t| t.weight > 0.0);
+        lit.map(|t| (t.moment.normalize_or(DVec3::Z), t.flux)).collect()
+    }
+
+    /// The same with what beams are cut by.
+    fn pooled(&self, across: usize) -> Vec<Texel> {
+        let pool = self.width.div_ceil(across).max(1);
         let (columns, rows) = (self.width.div_ceil(pool), self.height.div_ceil(pool));
         let mut texels = vec![Texel::default(); columns * rows];
         for row in 0..self.height {
@@ -232,7 +239,7 @@ pub fn beams(lights: &[Light], per_environment: usize) -> Vec<Beam> {
 }
 
 fn environment_beams(environment: &Environment, count: usize, out: &mut Vec<Beam>) {
-    let lit: Vec<Texel> = environment.pooled().into_iter().filter(|t| t.weight > 0.0).collect();
+    let lit: Vec<Texel> = environment.pooled(POOLED_WIDTH).into_iter().filter(|t| t.weight > 0.0).collect();
     if lit.is_empty() {
         return;
     }

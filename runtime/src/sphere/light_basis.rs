@@ -1,0 +1,474 @@
+//! Bases for light from infinity: what a transfer is baked for, and how lights become its coefficients.
+//!
+//! Three of them (Zhang, Dong and Ma 2013, section 4.1):
+//! - the *discrete spherical function*, DSF, the paper's: on the nodes of an [`Icosphere`],
+//!   `w_k(l) = W(t_k) / sum_i W(t_i)`, `W(t) = (h^2 - t^2)^3` for t < h, t the angle to node k and h the smallest angle
+//!   between two nodes. At most four nodes count for a direction;
+//! - *hats* on the same mesh: barycentric in the triangle that holds the direction (its corners times b make l, b
+//!   normalised to 1). Linear functions are kept, which the DSF, flat at every node, does not;
+//! - real spherical harmonics, [`super::harmonics`], signed and global.
+//!
+//! Coefficients of the first two are the adjoint mean, `s_k = 1/A_k int w_k L`, `A_k = int w_k`: whatever the light,
+//! `sum A_k s_k` is all of it, so a bright texel keeps its flux wherever it lies. The paper samples a Gaussian around
+//! each node, which keeps 0.92 to 1.06 of it at best. A directional light of irradiance E goes to the corners of its
+//! triangle, `s_k = E b_k / A_k`: without the 1/A_k it would have no units.
+//! Cost: a search of a triangle for each texel, of at most [`TEXELS_ACROSS`] x half as many.
+
+use super::harmonics::{MAX_COEFFICIENTS, MAX_ORDER, evaluate};
+use super::icosphere::Icosphere;
+use crate::light::{Environment, Light};
+use glam::{DMat3, DVec3, Vec3};
+use rayon::prelude::*;
+
+/// Environments wider than this are pooled first: 0.7 degrees a texel, a twelfth of an edge of 642 nodes.
+const TEXELS_ACROSS: usize = 512;
+/// Points along a side of a triangle in the quadrature of areas: 256 points a triangle.
+const AREA_POINTS: usize = 16;
+
+/// Which basis.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum BasisKind {
+    /// The discrete spherical function on so many nodes: 42, 162, 642 or 2562.
+    Discrete(usize),
+    /// Hats on so many nodes: 42, 162, 642 or 2562.
+    Hat(usize),
+    /// Harmonics of order 1 to 6.
+    Harmonics(usize),
+}
+
+impl BasisKind {
+    /// The number of basis functions.
+    pub fn len(self) -> usize {
+        match self {
+            Self::Discrete(nodes) | Self::Hat(nodes) => nodes,
+            Self::Harmonics(order) => order * order,
+        }
+    }
+
+    /// False: every basis has functions.
+    pub fn is_empty(self) -> bool {
+        false
+    }
+
+    /// The kind of a name such as `dsf642`, `hat162` or `sh6`.
+    pub fn of_name(name: &str) -> Option<Self> {
+        let split = name.find(|c: char| c.is_ascii_digit())?;
+        let number: usize = name[split..].parse().ok()?;
+        let nodes = number >= 42 && Icosphere::level_of(number).is_some();
+        match &name[..split] {
+            "dsf" if nodes => Some(Self::Discrete(number)),
+            "hat" if nodes => Some(Self::Hat(number)),
+            "sh" if (1..=MAX_ORDER).contains(&number) => Some(Self::Harmonics(number)),
+            _ => None,
+        }
+    }
+
+    /// The name that [`Self::of_name`] reads.
+    pub fn name(self) -> String {
+        match self {
+            Self::Discrete(nodes) => format!("dsf{nodes}"),
+            Self::Hat(nodes) => format!("hat{nodes}"),
+            Self::Harmonics(order) => format!("sh{order}"),
+        }
+    }
+}
+
+/// A basis ready for use. The mesh of harmonics is the one that direct light is sampled on.
+#[derive(Clone, Debug)]
+pub struct LightBasis {
+    kind: BasisKind,
+    mesh: Icosphere,
+    opposite: Vec<[u32; 3]>,
+    /// `h`, radians.
+    reach: f64,
+    /// `A_k` of the mesh's functions, steradian; sum 4 pi.
+    areas: Vec<f64>,
+}
+
+/// The mesh that harmonics are sampled on: 642 directions.
+const HARMONICS_LEVEL: u32 = 3;
+
+/// The local functions that are not zero at a direction, up to six of them: node and value.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Local {
+    /// The three corners of the triangle that holds it, then the three nodes across its sides.
+    pub nodes: [u32; 6],
+    /// Their values, >= 0; sum 1.
+    pub values: [f64; 6],
+}
+
+impl LightBasis {
+    /// Makes the mesh and its areas.
+    pub fn new(kind: BasisKind) -> Self {
+        let level = match kind {
+            BasisKind::Discrete(nodes) | BasisKind::Hat(nodes) => {
+                Icosphere::level_of(nodes).expect("a number of nodes that a mesh has")
+            }
+            BasisKind::Harmonics(_) => HARMONICS_LEVEL,
+        };
+        let mesh = Icosphere::new(level);
+        let nodes = mesh.directions();
+        let edges = mesh.triangles().iter().flat_map(|&[a, b, c]| [(a, b), (b, c), (c, a)]);
+        let reach = edges.map(|(a, b)| nodes[a as usize].angle_between(nodes[b as usize])).fold(f64::INFINITY, f64::min);
+        let opposite = mesh.opposite_nodes();
+        let mut basis = Self { kind, mesh, opposite, reach, areas: Vec::new() };
+        basis.areas = basis.quadrature();
+        basis
+    }
+
+    /// Which one it is.
+    pub fn kind(&self) -> BasisKind {
+        self.kind
+    }
+
+    /// The mesh of a local basis; of harmonics, the one that they are sampled on for direct light.
+    pub fn mesh(&self) -> &Icosphere {
+        &self.mesh
+    }
+
+    /// Integral of each of the mesh's functions, steradian.
+    pub fn areas(&self) -> &[f64] {
+        &self.areas
+    }
+
+    /// The functions of the mesh at a unit direction in `triangle`.
+    pub fn local(&self, triangle: usize, direction: DVec3) -> Local {
+        let (near, far) = (self.mesh.triangles()[triangle], self.opposite[triangle]);
+        let nodes = [near[0], near[1], near[2], far[0], far[1], far[2]];
+        let mut values = [0.0; 6];
+        match self.kind {
+            BasisKind::Discrete(_) => {
+                for (value, node) in values.iter_mut().zip(nodes) {
+                    let t = self.mesh.directions()[node as usize].angle_between(direction);
+                    *value = (self.reach * self.reach - t * t).max(0.0).powi(3);
+                }
+                // The farthest direction is 0.69 h from a node, so the sum is at least 0.43 h^6.
+                let sum: f64 = values.iter().sum();
+                values.iter_mut().for_each(|v| *v /= sum);
+            }
+            BasisKind::Hat(_) | BasisKind::Harmonics(_) => {
+                values[..3].copy_from_slice(&self.barycentric(triangle, direction));
+            }
+        }
+        Local { nodes, values }
+    }
+
+    /// The place of a unit direction in a triangle: >= 0 inside, sum 1.
+    pub fn barycentric(&self, triangle: usize, direction: DVec3) -> [f64; 3] {
+        let [a, b, c] = self.mesh.triangles()[triangle].map(|n| self.mesh.directions()[n as usize]);
+        let inside = (DMat3::from_cols(a, b, c).inverse() * direction).max(DVec3::ZERO);
+        (inside / inside.element_sum()).to_array()
+    }
+
+    /// All functions at a unit direction, in order.
+    pub fn values(&self, direction: DVec3) -> Vec<f64> {
+        match self.kind {
+            BasisKind::Harmonics(order) => {
+                evaluate(order, direction.as_vec3())[..order * order].iter().map(|&y| f64::from(y)).collect()
+            }
+            _ => {
+                let mut out = vec![0.0; self.kind.len()];
+                let local = self.local(self.mesh.triangle(direction), direction);
+                local.nodes.iter().zip(local.values).for_each(|(&n, v)| out[n as usize] += v);
+                out
+            }
+        }
+    }
+
+    /// The function with these coefficients at a unit direction.
+    pub fn reconstruct(&self, coefficients: &[[f64; 3]], direction: DVec3) -> [f64; 3] {
+        let add = |sum: &mut [f64; 3], value: f64, s: &[f64; 3]| (0..3).for_each(|c| sum[c] += value * s[c]);
+        let mut sum = [0.0; 3];
+        match self.kind {
+            BasisKind::Harmonics(order) => {
+                let values = evaluate(order, direction.as_vec3());
+                coefficients.iter().zip(values).for_each(|(s, y)| add(&mut sum, f64::from(y), s));
+            }
+            _ => {
+                let local = self.local(self.mesh.triangle(direction), direction);
+                let each = local.nodes.iter().zip(local.values);
+                each.for_each(|(&n, value)| add(&mut sum, value, &coefficients[n as usize]));
+            }
+        }
+        sum
+    }
+
+    /// Coefficients of the sum of `lights`, RGB radiance. Points are not at infinity, and count for nothing.
+    pub fn coefficients(&self, lights: &[Light]) -> Vec<[f64; 3]> {
+        let mut sums = vec![[0.0; 3]; self.kind.len()];
+        for light in lights {
+            match light {
+                Light::Environment(environment) => self.add_environment(environment, &mut sums),
+                Light::Directional { toward, irradiance } => {
+                    let flux = irradiance.map(f64::from);
+                    match self.kind {
+                        BasisKind::Harmonics(_) => self.add_harmonics(*toward, flux, &mut sums),
+                        _ => {
+                            let direction = toward.as_dvec3();
+                            let triangle = self.mesh.triangle(direction);
+                            let shares = self.barycentric(triangle, direction);
+                            for (node, share) in self.mesh.triangles()[triangle].into_iter().zip(shares) {
+                                (0..3).for_each(|c| sums[node as usize][c] += flux[c] * share);
+                            }
+                        }
+                    }
+                }
+                Light::Point { .. } => {}
+            }
+        }
+        if !matches!(self.kind, BasisKind::Harmonics(_)) {
+            sums.iter_mut().zip(&self.areas).for_each(|(s, area)| *s = s.map(|v| v / area));
+        }
+        sums
+    }
+
+    fn add_harmonics(&self, toward: Vec3, flux: [f64; 3], sums: &mut [[f64; 3]]) {
+        let values = evaluate(MAX_ORDER, toward);
+        let each = sums.iter_mut().zip(values);
+        each.for_each(|(s, y)| (0..3).for_each(|c| s[c] += flux[c] * f64::from(y)));
+    }
+
+    /// Adds the integral of every function against the environment.
+    fn add_environment(&self, environment: &Environment, sums: &mut [[f64; 3]]) {
+        let texels = environment.texels(TEXELS_ACROSS);
+        let rows = texels.par_chunks(TEXELS_ACROSS.max(texels.len().div_ceil(64)));
+        let parts = rows.map(|row| {
+            // Nodes that this part of the sky touches, in the order in which they are met.
+            let mut part = vec![[0.0; 3]; self.kind.len()];
+            for (toward, flux) in row {
+                match self.kind {
+                    BasisKind::Harmonics(_) => self.add_harmonics(toward.as_vec3(), *flux, &mut part),
+                    _ => {
+                        let local = self.local(self.mesh.triangle(*toward), *toward);
+                        for (&node, value) in local.nodes.iter().zip(local.values) {
+                            (0..3).for_each(|c| part[node as usize][c] += flux[c] * value);
+                        }
+                    }
+                }
+            }
+            part
+        });
+        for part in parts.collect::<Vec<_>>() {
+            sums.iter_mut().zip(part).for_each(|(s, p)| (0..3).for_each(|c| s[c] += p[c]));
+        }
+    }
+
+    /// `int w_k` over the sphere, triangle by triangle: midpoints of equal parts of the flat triangle, each with the
+    /// solid angle that it is seen under.
+    fn quadrature(&self) -> Vec<f64> {
+        let n = AREA_POINTS;
+        let parts: Vec<Vec<(u32, f64)>> = (0..self.mesh.triangles().len())
+            .into_par_iter()
+            .map(|t| {
+                let corners = self.mesh.triangles()[t].map(|n| self.mesh.directions()[n as usize]);
+                let mut sums = [0.0; 6];
+                let (mut total, mut nodes) = (0.0, [0; 6]);
+                for i in 0..n {
+                    for j in 0..2 * i + 1 {
+                        // Row i of the cut triangle has i + 1 upright parts and i upside down between them.
+                        let (third, up) = (1.0 / 3.0, j % 2 == 0);
+                        let (a, b) = match up {
+                            true => (i as f64 + 2.0 * third, (j / 2) as f64 + third),
+                            false => (i as f64 + third, (j / 2) as f64 + 2.0 * third),
+                        };
+                        let (a, b) = (a / n as f64, b / n as f64);
+                        let point = corners[0] * (1.0 - a) + corners[1] * (a - b) + corners[2] * b;
+                        // Equal flat parts: solid angle goes with 1 / r^3 (their plane is the same for all).
+                        let weight = point.length().powi(-3);
+                        let local = self.local(t, point.normalize());
+                        nodes = local.nodes;
+                        sums.iter_mut().zip(local.values).for_each(|(s, v)| *s += weight * v);
+                        total += weight;
+                    }
+                }
+                let scale = self.mesh.solid_angle(t) / total;
+                nodes.into_iter().zip(sums).map(|(node, s)| (node, s * scale)).collect()
+            })
+            .collect();
+        let mut areas = vec![0.0; self.mesh.directions().len()];
+        parts.iter().flatten().for_each(|(node, area)| areas[*node as usize] += area);
+        areas
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::icosphere::tests::directions;
+    use super::*;
+
+    const LOCAL: [BasisKind; 8] = [
+        BasisKind::Discrete(42),
+        BasisKind::Discrete(162),
+        BasisKind::Discrete(642),
+        BasisKind::Discrete(2562),
+        BasisKind::Hat(42),
+        BasisKind::Hat(162),
+        BasisKind::Hat(642),
+        BasisKind::Hat(2562),
+    ];
+
+    #[test]
+    fn names_and_kinds_are_the_same_thing() {
+        for kind in LOCAL.into_iter().chain([BasisKind::Harmonics(1), BasisKind::Harmonics(6)]) {
+            assert_eq!(BasisKind::of_name(&kind.name()), Some(kind));
+        }
+        for bad in ["", "dsf", "642", "dsf12", "dsf643", "hat", "sh0", "sh7", "sh", "DSF642", "dsf642x"] {
+            assert_eq!(BasisKind::of_name(bad), None, "{bad}");
+        }
+    }
+
+    #[test]
+    fn local_functions_are_a_partition_of_unity_and_interpolate() {
+        for kind in LOCAL {
+            let basis = LightBasis::new(kind);
+            for d in directions(4000) {
+                let local = basis.local(basis.mesh().triangle(d), d);
+                assert!((local.values.iter().sum::<f64>() - 1.0).abs() < 4e-16 * 4.0);
+                assert!(local.values.iter().all(|v| *v >= 0.0) && local.values.iter().filter(|v| **v > 0.0).count() <= 4);
+            }
+            for (k, d) in basis.mesh().directions().iter().enumerate().step_by(7) {
+                let values = basis.values(*d);
+                // A node on the border of its triangle by rounding: 1e-15 of a barycentric coordinate.
+                assert!((values[k] - 1.0).abs() < 1e-12, "{kind:?} node {k}: {}", values[k]);
+            }
+            let total: f64 = basis.areas().iter().sum();
+            assert!((total / (4.0 * std::f64::consts::PI) - 1.0).abs() < 1e-12);
+        }
+    }
+
+    #[test]
+    fn no_function_that_reaches_a_direction_is_left_out() {
+        // The six nodes of a triangle are all within h of any direction in it: brute force over all nodes.
+        let basis = LightBasis::new(BasisKind::Discrete(642));
+        for d in directions(3000) {
+            let near = basis.mesh().directions().iter().filter(|n| n.angle_between(d) < basis.reach).count();
+            let local = basis.local(basis.mesh().triangle(d), d);
+            assert_eq!(local.values.iter().filter(|v| **v > 0.0).count(), near, "{d}");
+        }
+    }
+
+    #[test]
+    fn areas_agree_with_a_quadrature_over_the_whole_sphere() {
+        for kind in [BasisKind::Discrete(162), BasisKind::Hat(162)] {
+            let basis = LightBasis::new(kind);
+            let count = 400_000;
+            let mut areas = vec![0.0; 162];
+            for d in directions(count) {
+                let local = basis.local(basis.mesh().triangle(d), d);
+                let each = 4.0 * std::f64::consts::PI / count as f64;
+                local.nodes.iter().zip(local.values).for_each(|(&n, v)| areas[n as usize] += v * each);
+            }
+            // 2,500 spiral points a function, whose sums are good to about the root of a point's share: 1e-3.
+            for (found, expected) in basis.areas().iter().zip(areas) {
+                assert!((found / expected - 1.0).abs() < 1e-3, "{kind:?}: {found} {expected}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_bright_texel_keeps_its_flux_wherever_it_is_and_a_sun_too() {
+        for kind in [BasisKind::Discrete(642), BasisKind::Hat(642)] {
+            let basis = LightBasis::new(kind);
+            for (row, column) in [(0, 0), (1, 100), (64, 511), (200, 77), (255, 300)] {
+                let mut environment = Environment::constant([0.0; 3]);
+                (environment.width, environment.height, environment.rotation) = (512, 256, 0.7);
+                environment.radiance = vec![[0.0; 3]; 512 * 256];
+                environment.radiance[row * 512 + column] = [0.0, 1e6, 0.0];
+                let edge = |row: usize| (std::f64::consts::PI * row as f64 / 256.0).cos();
+                let flux = 1e6 * (edge(row) - edge(row + 1)) * std::f64::consts::TAU / 512.0;
+                let coefficients = basis.coefficients(&[Light::Environment(environment)]);
+                let sum: f64 = coefficients.iter().zip(basis.areas()).map(|(s, a)| s[1] * a).sum();
+                assert!((sum / flux - 1.0).abs() < 1e-9, "{kind:?} {row} {column}: {sum} {flux}");
+            }
+            for toward in directions(50) {
+                let sun = Light::Directional { toward: toward.as_vec3(), irradiance: [3.0, 0.0, 1.0] };
+                let coefficients = basis.coefficients(&[sun]);
+                let sum: f64 = coefficients.iter().zip(basis.areas()).map(|(s, a)| s[0] * a).sum();
+                assert!((sum / 3.0 - 1.0).abs() < 1e-12);
+                assert!(coefficients.iter().filter(|s| s[0] > 0.0).count() <= 3);
+            }
+        }
+    }
+
+    #[test]
+    fn a_black_sky_and_no_light_at_all_have_zero_coefficients() {
+        for kind in [BasisKind::Discrete(42), BasisKind::Hat(42), BasisKind::Harmonics(6)] {
+            let basis = LightBasis::new(kind);
+            let black = Light::Environment(Environment::constant([0.0; 3]));
+            for lights in [&[][..], &[black]] {
+                assert!(basis.coefficients(lights).iter().flatten().all(|v| *v == 0.0));
+            }
+        }
+    }
+
+    /// Relative L2 distance of what the basis makes of `light` from it.
+    fn error(basis: &LightBasis, environment: &Environment) -> f64 {
+        let coefficients = basis.coefficients(&[Light::Environment(environment.clone())]);
+        let (mut difference, mut square) = (0.0, 0.0);
+        for d in directions(60_000) {
+            let [u, v] = environment.place(d.as_vec3());
+            let at = (u * environment.width as f64) as usize % environment.width;
+            let row = ((v * environment.height as f64) as usize).min(environment.height - 1);
+            let truth = f64::from(environment.radiance[row * environment.width + at][0]);
+            let found = basis.reconstruct(&coefficients, d)[0];
+            difference += (truth - found).powi(2);
+            square += truth * truth;
+        }
+        (difference / square).sqrt()
+    }
+
+    /// 0 and 1 on a chequer of 2 x 2 fields a face of the cube.
+    fn chequer() -> Environment {
+        let mut environment = Environment::constant([0.0; 3]);
+        (environment.width, environment.height) = (1024, 512);
+        environment.radiance = (0..1024 * 512)
+            .map(|t| {
+                let d = environment.direction(((t % 1024) as f64 + 0.5) / 1024.0, ((t / 1024) as f64 + 0.5) / 512.0);
+                let major = d.abs().max_element();
+                let others = d.to_array().map(|c| if c.abs() < major { f64::from(c < 0.0) } else { 0.0 });
+                [(others.iter().sum::<f64>() as i32 % 2) as f32; 3]
+            })
+            .collect();
+        environment
+    }
+
+    #[test]
+    fn a_chequer_is_met_better_by_more_nodes_as_in_the_paper_and_better() {
+        // The paper's figures are 13.2 : 8.9 : 7.3 for 162, 642, 2562 nodes, 1 : 0.67 : 0.55, of a pattern and a norm that
+        // it does not give. Measured beforehand for this one: 0.428, 0.282, 0.211 with the adjoint mean, which is
+        // 1 : 0.66 : 0.49; where the borders of the fields lie between nodes moves the ratios by 0.03.
+        let turned = |kind: BasisKind, rotation: f64| error(&LightBasis::new(kind), &Environment { rotation, ..chequer() });
+        let mean = |kind: BasisKind| [0.0, 0.2, 0.6, 1.1].map(|r| turned(kind, r)).iter().sum::<f64>() / 4.0;
+        for kind in [BasisKind::Discrete as fn(usize) -> BasisKind, BasisKind::Hat] {
+            let errors = [162, 642, 2562].map(|nodes| mean(kind(nodes)));
+            println!("{:?}: {errors:.4?}", kind(0));
+            assert!(errors.iter().zip([0.428, 0.282, 0.211]).all(|(e, most)| *e <= most), "{errors:?}");
+            assert!(errors[2] / errors[0] < 0.505, "{errors:?}");
+        }
+        let harmonics = mean(BasisKind::Harmonics(6));
+        println!("sh6: {harmonics:.4}");
+        assert!(mean(BasisKind::Discrete(42)) > harmonics && mean(BasisKind::Discrete(162)) < harmonics);
+    }
+
+    #[test]
+    fn hats_meet_a_smooth_sky_better_than_the_discrete_function() {
+        let mut sky = Environment::constant([0.0; 3]);
+        (sky.width, sky.height) = (1024, 512);
+        sky.radiance = (0..1024 * 512)
+            .map(|t| [(1.0 + (std::f64::consts::PI * ((t / 1024) as f64 + 0.5) / 512.0).cos()) as f32; 3])
+            .collect();
+        let (hat, discrete) =
+            (error(&LightBasis::new(BasisKind::Hat(642)), &sky), error(&LightBasis::new(BasisKind::Discrete(642)), &sky));
+        // 0.36 % and 1.26 % were measured beforehand for a lobe 1 + cos.
+        assert!(hat < 0.005 && discrete < 0.015 && hat < 0.5 * discrete, "{hat} {discrete}");
+    }
+
+    #[test]
+    fn harmonics_of_a_sun_are_its_irradiance_times_the_harmonics_there() {
+        let basis = LightBasis::new(BasisKind::Harmonics(4));
+        let toward = Vec3::new(0.48, -0.6, 0.64);
+        let found = basis.coefficients(&[Light::Directional { toward, irradiance: [2.0; 3] }]);
+        let expected: [f32; MAX_COEFFICIENTS] = evaluate(4, toward);
+        assert!(found.iter().zip(expected).all(|(s, y)| (s[1] - 2.0 * f64::from(y)).abs() < 1e-6));
+    }
+}
