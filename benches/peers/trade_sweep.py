@@ -3,8 +3,8 @@ import re
 
 import mitsuba_scene as ms
 
-# Larger than this, a plot is left to the sweep's own page.
-MOST_BYTES = 200_000
+# The plots that are taken, of the first scene and frame; the dials one by one are left to the sweep's own page.
+TAKEN = ["Error against seconds", "Error against size of the pack"]
 
 
 def figures(page):
@@ -27,11 +27,12 @@ def sweep(program, chosen):
              "Its page, `sweep/index.html`, has these plots and the pictures of each point; `sweep.csv` and `sweep.json` have the figures."]
     for old in chosen.images.glob("trade_sweep_*.svg"):
         old.unlink()
-    count = 0
+    plots = {}
     for title, svg in figures((folder / "index.html").read_text()):
-        if len(svg) <= MOST_BYTES:
-            count += 1
-            name = f"trade_sweep_{count}.svg"
-            (chosen.images / name).write_text(svg)
-            lines += ["", f"![{title or f'Plot {count} of the sweep'}](images/{name})"]
-    return lines, [] if count else ["sweep: no plot in its page"]
+        if title in TAKEN:
+            plots.setdefault(title, svg)
+    for count, (title, svg) in enumerate(plots.items(), 1):
+        name = f"trade_sweep_{count}.svg"
+        (chosen.images / name).write_text(svg)
+        lines += ["", f"![{title}](images/{name})"]
+    return lines, [f"sweep: no plot {title!r} in its page" for title in TAKEN if title not in plots]
