@@ -24,7 +24,7 @@ def sweep(program, chosen):
     program.run("sweep", source, "--scene", scene, "-o", folder, "--resume", "--progress", "none", *chosen.sweep_options)
     lines = ["## Every dial", "",
              "`smoke-bake sweep testdata/plume/plume.####.vdb --scene testdata/scenes/sunset.toml -o sweep` on the sequence that comes with the program. "
-             "Its page, `sweep/index.html`, has these plots and the pictures of each point; `sweep.csv` and `sweep.json` have the figures."]
+             "Its page, `sweep/index.html`, has these plots with their legends and the pictures of each point; `sweep.csv` and `sweep.json` have the figures."]
     for old in chosen.images.glob("trade_sweep_*.svg"):
         old.unlink()
     plots = {}
