@@ -9,6 +9,7 @@ pub mod fit;
 pub mod pipeline;
 pub mod residual;
 pub mod survey;
+pub mod transfer;
 pub mod work;
 
 pub use error::{Error, Result};

@@ -3,6 +3,7 @@
 pub mod compensated;
 pub mod medium;
 pub mod reference;
+pub mod transfer;
 
 use crate::march::ShadedVolume;
 use crate::medium::field::DensityField;

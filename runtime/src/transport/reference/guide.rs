@@ -8,9 +8,9 @@
 //! around it, so that the guess is smooth. Where little of the sky gets through at all, it is looked at by chance only. Measured on the plume under a sunset: see `docs/decisions/040-reference.md`.
 //! Cost: bricks x tiles short walks, once; one binary search a direction.
 
-use super::majorant::Majorants;
 use super::sky::{BINS, Sky};
-use super::tracking::{Ray, Space};
+use crate::tracking::flight::{Ray, Space};
+use crate::tracking::majorant::Majorants;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 

@@ -2,11 +2,11 @@
 //! where light gets through ([`super::guide`]); and points.
 
 use super::guide::{self, Guide};
-use super::majorant::Majorants;
 use super::sky::Sky;
-use super::tracking::Space;
 use crate::light::Light;
 use crate::medium::field::DensityField;
+use crate::tracking::flight::Space;
+use crate::tracking::majorant::Majorants;
 use glam::{DVec3, Vec3};
 
 /// Cells along the side of a guide's brick, as a power of two.

@@ -2,7 +2,7 @@
 //!
 //! `L(x, w) = int T(x, y) sigma_t D(y) albedo int p(w, w') L(y, w') dw' dy + T L_sky`, estimated without any grid of
 //! radiance, band or fit: the only things cut are the seed's numbers and [`path::LONGEST`] collisions. Paths are made as
-//! [`path`] says, flights and transmittance as [`tracking`] says.
+//! [`path`] says, flights and transmittance as [`crate::tracking::flight`] says.
 //!
 //! *Passes.* Every pass gives each pixel an independent estimate: its samples are spread evenly within the pass and
 //! scrambled by a seed of their own. So the standard error of a pixel's mean over n passes is that of n independent
@@ -16,24 +16,20 @@
 
 mod guide;
 mod lights;
-mod majorant;
 mod path;
-mod phase;
-mod sampler;
 mod sky;
-mod tracking;
 
 use crate::backdrop::Sky;
 use crate::camera::Camera;
 use crate::film::{Film, Pixel};
 use crate::light::Light;
 use crate::medium::field::DensityField;
+use crate::tracking::flight::{Column, Extinction, Space};
 use crate::transport::medium::{MediumError, MediumParameters};
 use glam::Vec3;
 use lights::Lights;
 use path::Scene;
 use rayon::prelude::*;
-use tracking::{Column, Extinction, Space};
 
 /// Fewest passes of an image: a standard error from fewer is itself off by a fifth.
 pub const LEAST_PASSES: u32 = 16;

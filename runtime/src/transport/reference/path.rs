@@ -10,12 +10,12 @@
 //! Cost: a pixel without smoke one look along its rays; others `RAYS * ENDS` paths.
 
 use super::lights::{Lights, share};
-use super::phase;
-use super::sampler::{Random, Strata, mix};
-use super::tracking::{Column, Extinction, Ray, Space};
 use crate::backdrop::Sky as Backdrop;
 use crate::camera::Camera;
 use crate::march::Backdrop as _;
+use crate::tracking::flight::{Column, Extinction, Ray, Space};
+use crate::tracking::phase;
+use crate::tracking::sampler::{Random, Strata, mix};
 use glam::{DVec3, Vec3};
 
 /// Rays through a pixel in one pass.

@@ -246,7 +246,7 @@ fn linear(a: f32, b: f32, u: f32) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::transport::reference::sampler::{Random, Strata};
+    use crate::tracking::sampler::{Random, Strata};
 
     /// A dim slope with one texel like a sun, and a black quarter.
     fn map() -> Environment {

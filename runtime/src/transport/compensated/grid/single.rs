@@ -10,6 +10,7 @@
 use super::columns::{Path, Shift, SweepGrid, stencil};
 use crate::lanes::exp_neg;
 use crate::light::Beam;
+use glam::Vec3;
 use multiversion::multiversion;
 use rayon::prelude::*;
 
@@ -79,6 +80,18 @@ pub fn single_scattering(grid: &SweepGrid, beams: &[WeightedBeam], sigma_t: &[f3
         });
     }
     planes
+}
+
+/// Transmittance to every node near density from each of some directions to the light, unit vectors; zero at the other
+/// nodes. `sigma_t` is extinction per unit density and world length.
+pub fn transmittance_from(grid: &SweepGrid, toward: &[Vec3], sigma_t: f32) -> Vec<Vec<f32>> {
+    let sweep = |turned: &mut Vec<f32>, toward: &Vec3| {
+        let mut out = vec![0.0; grid.len()];
+        let path = grid.path(*toward);
+        transmittances(grid, &path, &[sigma_t], vec![&mut out], grid.dims[0], turned);
+        out
+    };
+    toward.par_iter().map_init(|| vec![0.0; grid.len()], sweep).collect()
 }
 
 /// Up to [`GROUP`] planes that need the same transmittances.
@@ -222,7 +235,7 @@ fn deposit(grid: &SweepGrid, rays: &Rays, path: &Path, shift: &Shift, sigma: f32
 mod tests {
     use super::*;
     use crate::medium::field::DensityField;
-    use glam::{DAffine3, DMat3, DVec3, Vec3};
+    use glam::{DAffine3, DMat3, DVec3};
 
     /// A Gaussian blob of radius 5 voxels in a 24-cube, in a sheared and stretched world.
     fn blob() -> DensityField {

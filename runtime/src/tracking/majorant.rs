@@ -87,6 +87,19 @@ impl Majorants {
         far: f64,
         mut visit: impl FnMut(f64, f64, Bounds) -> bool,
     ) {
+        self.walk_bricks(origin, direction, near, far, |from, to, brick| visit(from, to, self.bounds[brick]));
+    }
+
+    /// The same with the number of the brick in place of its bounds.
+    #[inline(always)]
+    pub fn walk_bricks(
+        &self,
+        origin: DVec3,
+        direction: DVec3,
+        near: f64,
+        far: f64,
+        mut visit: impl FnMut(f64, f64, usize) -> bool,
+    ) {
         let start = origin + direction * near;
         let per_brick = 1.0 / self.side;
         let (mut place, mut leaves, mut between) = ([0isize; 3], [f64::INFINITY; 3], [f64::INFINITY; 3]);
@@ -121,8 +134,7 @@ impl Majorants {
                 2
             };
             let to = leaves[axis].min(far);
-            let bound = self.bounds[at as usize];
-            if bound[1] > 0.0 && to > from && visit(from, to, bound) {
+            if self.bounds[at as usize][1] > 0.0 && to > from && visit(from, to, at as usize) {
                 return;
             }
             if leaves[axis] >= far {
@@ -142,7 +154,7 @@ impl Majorants {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::transport::reference::sampler::Random;
+    use crate::tracking::sampler::Random;
     use glam::DAffine3;
 
     fn field() -> DensityField {

@@ -37,7 +37,7 @@ pub fn sample(g: f32, before: Vec3, u: [f32; 2]) -> (Vec3, f32) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::transport::reference::sampler::Random;
+    use crate::tracking::sampler::Random;
 
     const G: [f32; 9] = [-0.99, -0.6, -0.2, -5e-5, 0.0, 0.3, 0.6, 0.85, 0.99];
 

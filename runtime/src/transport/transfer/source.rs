@@ -1,0 +1,335 @@
+//! Source radiance of a frame with transfer, under any light from infinity (Zhang, Dong and Ma 2013, sections 6.3, 6.4).
+//!
+//! With the light's coefficients s and the clusters' bases, each cluster is lit, not each voxel (the paper's Eq. 19):
+//! - *direct*: `I_i(w) = albedo sum over q of V_i[q] E_q p(w . l_q)`, E_q what the light brings from direction q of the
+//!   mesh, p the phase function itself. It depends on where it is seen from, so it is found for the directions that the
+//!   smoke is seen in ([`super::view_directions`]), and once where light scatters evenly;
+//! - *indirect*: `I_i,lm = sum over k of s_k B_i[k, lm]`, then each cell's moments.
+//!
+//! A node sends out `sum over t of weight_t I_t` of its cluster, and the indirect light of the cells around it. What a sun
+//! brings directly is swept at run time instead (`sharp_suns`): baked, it would be a lobe as wide as the mesh's edges.
+//! Costs: *light* clusters x (1 + terms) x directions x 3, and lights x coefficients more for the indirect part; *view*
+//! that of the direct part for each direction in use, and (1 + terms) x 4 vectors a node.
+
+use super::cells::Cells;
+use super::frame::{Clustered, FrameTransfer};
+use super::lit_nodes::lit_nodes;
+use super::view_directions::{Between, ViewDirections};
+use crate::light::Light;
+use crate::march::ShadedVolume;
+use crate::medium::field::DensityField;
+use crate::product::add_product;
+use crate::sphere::harmonics::evaluate;
+use crate::sphere::light_basis::BasisKind;
+use crate::tracking::phase;
+use crate::transport::SourceRadiance;
+use crate::transport::compensated::grid::columns::SweepGrid;
+use crate::transport::compensated::grid::single::transmittance_from;
+use glam::{DVec3, Vec3, Vec4};
+use rayon::prelude::*;
+use std::sync::Arc;
+
+/// The dials of the method.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct TransferSettings {
+    /// True sweeps what directional lights bring directly at run time; false takes it from the pack, as a lobe.
+    pub sharp_suns: bool,
+}
+
+impl Default for TransferSettings {
+    fn default() -> Self {
+        Self { sharp_suns: true }
+    }
+}
+
+/// Why a frame cannot be rendered by its transfer.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[error("transfer: {part} has {found}, expected {expected}; bake the pack again")]
+pub struct TransferError {
+    /// Which part.
+    pub part: &'static str,
+    /// What it has.
+    pub found: String,
+    /// What the frame's density asks for.
+    pub expected: String,
+}
+
+/// One frame with its transfer, ready to be lit: everything that depends on neither light nor view.
+pub struct TransferTransport {
+    transfer: Arc<FrameTransfer>,
+    nodes: Arc<Vec<u32>>,
+    cells: Arc<Cells>,
+    settings: TransferSettings,
+    /// For sweeps of suns; made for the first.
+    grid: Option<SweepGrid>,
+}
+
+/// What a sun brings directly: its direction, irradiance times albedo, and transmittance to each lit node, by channel.
+struct Sun {
+    toward: Vec3,
+    power: [f32; 3],
+    transmittance: [Arc<Vec<f32>>; 3],
+}
+
+/// A lit frame.
+pub struct TransferSource {
+    transfer: Arc<FrameTransfer>,
+    nodes: Arc<Vec<u32>>,
+    cells: Arc<Cells>,
+    /// Irradiance from each direction of the mesh.
+    irradiance: Vec<[f32; 3]>,
+    suns: Vec<Sun>,
+    /// `[cell][lm]`, RGB and a zero.
+    moments: Vec<Vec4>,
+    /// Direct radiance of each set's clusters where it is the same from everywhere.
+    even: Option<Vec<Vec<Vec4>>>,
+}
+
+impl TransferTransport {
+    /// Checks that the transfer is one for this density.
+    pub fn new(
+        field: &DensityField,
+        transfer: Arc<FrameTransfer>,
+        settings: TransferSettings,
+    ) -> Result<Self, TransferError> {
+        let (nodes, cells) = (lit_nodes(field), Cells::new(field, transfer.shift));
+        let check = |part, sets: &[Clustered], rows: usize, length: usize| {
+            let bad = sets.iter().find(|set| {
+                let ids = set.ids.iter().all(|&id| usize::from(id) < set.clusters());
+                !(set.ids.len() == rows && set.weights.len() == rows * set.terms && ids)
+                    || !(set.length == length || rows == 0)
+            });
+            bad.map_or(Ok(()), |set| {
+                let found = format!("{} rows of {} numbers", set.ids.len(), set.length);
+                Err(TransferError { part, found, expected: format!("{rows} rows of {length} numbers") })
+            })
+        };
+        let lights = transfer.basis.kind().len();
+        check("direct light", &transfer.direct, nodes.len(), transfer.basis.areas().len())?;
+        check("indirect light", &transfer.indirect, cells.len(), lights * transfer.bands * transfer.bands)?;
+        Ok(Self { transfer, nodes: Arc::new(nodes), cells: Arc::new(cells), settings, grid: None })
+    }
+
+    /// Lights the frame `field`, the same as at [`Self::new`]; points count for nothing.
+    pub fn light(&mut self, field: &DensityField, lights: &[Light]) -> TransferSource {
+        let transfer = self.transfer.clone();
+        let basis = &transfer.basis;
+        let coefficients = basis.coefficients(lights);
+        let (suns, rest): (Vec<&Light>, Vec<&Light>) =
+            lights.iter().partition(|l| self.settings.sharp_suns && matches!(l, Light::Directional { .. }));
+        let without_suns = match suns.is_empty() {
+            true => coefficients.clone(),
+            false => basis.coefficients(&rest.into_iter().cloned().collect::<Vec<_>>()),
+        };
+        let irradiance: Vec<[f32; 3]> = (0..basis.areas().len())
+            .map(|q| {
+                let radiance = match basis.kind() {
+                    BasisKind::Harmonics(_) => basis.reconstruct(&without_suns, basis.mesh().directions()[q]),
+                    _ => without_suns[q],
+                };
+                radiance.map(|r| (r * basis.areas()[q]) as f32)
+            })
+            .collect();
+        let suns = suns.into_iter().filter_map(|sun| self.sweep(field, sun)).collect();
+        let moments = moments(&transfer, &self.cells, &coefficients);
+        let mut source = TransferSource {
+            nodes: self.nodes.clone(),
+            cells: self.cells.clone(),
+            transfer,
+            irradiance,
+            suns,
+            moments,
+            even: None,
+        };
+        if source.transfer.medium.g == 0.0 {
+            source.even = Some(source.lit_clusters(&[DVec3::Z]));
+        }
+        source
+    }
+
+    fn sweep(&mut self, field: &DensityField, sun: &Light) -> Option<Sun> {
+        let Light::Directional { toward, irradiance } = *sun else { return None };
+        let grid = self.grid.get_or_insert_with(|| SweepGrid::new(field));
+        let medium = &self.transfer.medium;
+        let mut found: Vec<(f32, Arc<Vec<f32>>)> = Vec::new();
+        for sigma_t in medium.sigma_t {
+            if !found.iter().any(|(sigma, _)| *sigma == sigma_t) {
+                let plane = &transmittance_from(grid, &[toward], sigma_t)[0];
+                let at_nodes = self.nodes.iter().map(|&node| plane[node as usize]).collect();
+                found.push((sigma_t, Arc::new(at_nodes)));
+            }
+        }
+        let of = |sigma_t: f32| found.iter().find(|(sigma, _)| *sigma == sigma_t).map(|(_, t)| t.clone());
+        let transmittance = [0, 1, 2].map(|c| of(medium.sigma_t[c]).unwrap_or_default());
+        Some(Sun { toward, power: [0, 1, 2].map(|c| irradiance[c] * medium.albedo[c]), transmittance })
+    }
+}
+
+/// Moments of every cell, from the indirect light of the clusters.
+fn moments(transfer: &FrameTransfer, cells: &Cells, coefficients: &[[f64; 3]]) -> Vec<Vec4> {
+    let n = transfer.bands * transfer.bands;
+    let mut out = vec![Vec4::ZERO; cells.len() * n];
+    for (s, set) in transfer.indirect.iter().enumerate() {
+        let channels: Vec<usize> = (0..3).filter(|&c| transfer.indirect_of_channel[c] == s).collect();
+        if set.length == 0 || channels.is_empty() {
+            continue;
+        }
+        // One light's coefficients after another: the sums are over a cluster's `[light][lm]`.
+        let lit: Vec<[Vec4; 1]> = set
+            .bases
+            .par_chunks_exact(set.length)
+            .flat_map_iter(|basis| {
+                let mut sums = vec![[Vec4::ZERO; 1]; n];
+                for (row, s) in basis.chunks_exact(n).zip(coefficients) {
+                    let mut light = Vec4::ZERO;
+                    channels.iter().for_each(|&c| light[c] = s[c] as f32);
+                    sums.iter_mut().zip(row).for_each(|(sum, v)| sum[0] += light * *v);
+                }
+                sums
+            })
+            .collect();
+        let each = 1 + set.terms;
+        out.par_chunks_exact_mut(n).enumerate().for_each(|(cell, out)| {
+            let first = usize::from(set.ids[cell]) * each * n;
+            let (mean, directions) = lit[first..first + each * n].split_at(n);
+            out.iter_mut().zip(mean).for_each(|(o, m)| *o += m[0]);
+            let weights = &set.weights[cell * set.terms..][..set.terms];
+            for (weight, direction) in weights.iter().zip(directions.chunks_exact(n)) {
+                out.iter_mut().zip(direction).for_each(|(o, d)| *o += d[0] * *weight);
+            }
+        });
+    }
+    out
+}
+
+impl TransferSource {
+    /// Radiance that each direct cluster and each of its directions sends the way that is seen along each of `views`,
+    /// unit vectors from the eye: for each set `[view][cluster][1 + terms]`.
+    fn lit_clusters(&self, views: &[DVec3]) -> Vec<Vec<Vec4>> {
+        let transfer = &self.transfer;
+        let (mesh, medium) = (transfer.basis.mesh(), &transfer.medium);
+        let of_set = |(s, set): (usize, &Clustered)| {
+            let channels: Vec<usize> = (0..3).filter(|&c| transfer.direct_of_channel[c] == s).collect();
+            // What each direction q brings into each view: [q][view][channel].
+            let columns = views.len() * channels.len();
+            let mut light = vec![0.0f32; self.irradiance.len() * columns];
+            light.par_chunks_exact_mut(columns.max(1)).enumerate().for_each(|(q, out)| {
+                let toward = mesh.directions()[q].as_vec3();
+                for (view, out) in views.iter().zip(out.chunks_exact_mut(channels.len())) {
+                    let scattered = phase::value(medium.g, view.as_vec3().dot(toward));
+                    let each = out.iter_mut().zip(&channels);
+                    each.for_each(|(o, &c)| *o = scattered * medium.albedo[c] * self.irradiance[q][c]);
+                }
+            });
+            let rows = set.bases.len().checked_div(set.length).unwrap_or(0);
+            let mut lit = vec![0.0f32; rows * columns];
+            add_product(&mut lit, &set.bases, &light, set.length, columns);
+            let at = |view: usize, row: usize| {
+                let mut out = Vec4::ZERO;
+                let from = &lit[row * columns + view * channels.len()..][..channels.len()];
+                channels.iter().zip(from).for_each(|(&c, v)| out[c] = *v);
+                out
+            };
+            (0..views.len() * rows).into_par_iter().map(|i| at(i / rows, i % rows)).collect()
+        };
+        transfer.direct.iter().enumerate().map(of_set).collect()
+    }
+}
+
+/// Nodes that one task shades.
+const BLOCK: usize = 4096;
+
+impl SourceRadiance for TransferSource {
+    fn depends_on_view(&self) -> bool {
+        self.transfer.medium.g != 0.0
+    }
+
+    fn shade(&self, field: &DensityField, eye: DVec3) -> ShadedVolume {
+        let transfer = &self.transfer;
+        let [nx, ny, _] = field.dims;
+        let node_eye = field.world_from_node.inverse().transform_point3(eye);
+        let linear = field.world_from_node.matrix3;
+        let place = |node: u32| [node as usize % nx, node as usize / nx % ny, node as usize / nx / ny];
+        let along = |at: [usize; 3]| linear * (DVec3::from_array(at.map(|v| v as f64)) - node_eye);
+        let (view, lit) = match &self.even {
+            Some(lit) => (None, lit),
+            None => {
+                let seen: Vec<Between> = self.nodes.par_iter().map(|&n| Between::of(along(place(n)))).collect();
+                let view = ViewDirections::of(seen.iter().copied());
+                let lit = self.lit_clusters(view.directions());
+                (Some((view, seen)), &{ lit })
+            }
+        };
+        let cells = self.seen_cells(field, eye);
+        let radiance = |first: usize, nodes: &[u32]| -> Vec<[f32; 3]> {
+            let mut out = Vec::with_capacity(nodes.len());
+            for (row, &node) in (first..).zip(nodes) {
+                let at = place(node);
+                let mut sum = Vec4::ZERO;
+                for (set, lit) in transfer.direct.iter().zip(lit) {
+                    let each = 1 + set.terms;
+                    let clusters = set.clusters() * each;
+                    let cluster = usize::from(set.ids[row]) * each;
+                    let weights = &set.weights[row * set.terms..][..set.terms];
+                    let from = |view: usize| {
+                        let lit = &lit[view * clusters + cluster..][..each];
+                        let directions = weights.iter().zip(&lit[1..]);
+                        directions.fold(lit[0], |sum, (w, l)| sum + *l * *w)
+                    };
+                    sum += match &view {
+                        None => from(0),
+                        Some((view, seen)) => {
+                            let around = view.around(seen[row]);
+                            around.iter().fold(Vec4::ZERO, |sum, (v, w)| sum + from(*v as usize) * *w)
+                        }
+                    };
+                }
+                for sun in &self.suns {
+                    let scattered = match self.even {
+                        Some(_) => phase::value(0.0, 0.0),
+                        None => {
+                            let way = along(at).normalize_or(DVec3::Z).as_vec3();
+                            phase::value(transfer.medium.g, way.dot(sun.toward))
+                        }
+                    };
+                    (0..3).for_each(|c| sum[c] += scattered * sun.power[c] * sun.transmittance[c][row]);
+                }
+                for (cell, weight) in self.cells.around(at) {
+                    if weight > 0.0 {
+                        sum += cells[cell as usize] * weight;
+                    }
+                }
+                // A truncated series can dip below zero; radiance cannot.
+                let sum = sum.max(Vec4::ZERO);
+                out.push([sum.x, sum.y, sum.z]);
+            }
+            out
+        };
+        let blocks = self.nodes.par_chunks(BLOCK).enumerate().map(|(b, nodes)| radiance(b * BLOCK, nodes));
+        let blocks: Vec<Vec<[f32; 3]>> = blocks.collect();
+        let mut shaded: Vec<[f32; 4]> = vec![[0.0; 4]; field.values.len()];
+        for (&node, [r, g, b]) in self.nodes.iter().zip(blocks.iter().flatten()) {
+            shaded[node as usize] = [*r, *g, *b, field.values[node as usize]];
+        }
+        ShadedVolume::new(field.dims, &shaded, field.world_from_node)
+    }
+}
+
+impl TransferSource {
+    /// Indirect radiance of each cell the way it is seen from `eye`.
+    fn seen_cells(&self, field: &DensityField, eye: DVec3) -> Vec<Vec4> {
+        let n = self.transfer.bands * self.transfer.bands;
+        let [bx, by, _] = self.cells.majorants.bricks;
+        let mut middles = vec![DVec3::ZERO; self.cells.len()];
+        for (brick, &place) in self.cells.places.iter().enumerate().filter(|(_, p)| **p != super::cells::EMPTY) {
+            let at = [brick % bx, brick / bx % by, brick / bx / by];
+            let middle = DVec3::from_array(at.map(|b| (b as f64 + 0.5) * self.cells.majorants.side));
+            middles[place as usize] = field.world_from_node.transform_point3(middle);
+        }
+        let seen = |(moments, middle): (&[Vec4], &DVec3)| {
+            let harmonics = evaluate(self.transfer.bands, (*middle - eye).normalize_or(DVec3::Z).as_vec3());
+            moments.iter().zip(harmonics).fold(Vec4::ZERO, |sum, (m, y)| sum + *m * y)
+        };
+        self.moments.par_chunks_exact(n).zip(&middles).map(seen).collect()
+    }
+}
