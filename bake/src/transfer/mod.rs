@@ -33,7 +33,7 @@ pub struct TransferSettings {
     pub clusters: usize,
     /// Directions of each cluster, 0 to 255.
     pub terms: usize,
-    /// Photons for each face of a cell on the border and each basis light.
+    /// Photons for each face of a voxel on the border and each light of the indirect basis.
     pub photons: u32,
     /// Indirect cells have `2^shift` voxels a side, 0 to 4.
     pub shift: u32,
@@ -133,10 +133,11 @@ pub struct RunTransfer {
     pub peak_bytes: u64,
 }
 
-/// Bakes the transfer of a run of frames. `observe(stage, done, all)` is told where it is.
+/// Bakes the transfer of a run of frames, for light of `basis` (that of the settings) and indirect light of its coarser
+/// one. `observe(stage, done, all)` is told where it is.
 pub fn bake_run(
     fields: &[&DensityField],
-    basis: &LightBasis,
+    [basis, indirect_basis]: [&LightBasis; 2],
     settings: &TransferSettings,
     observe: &(dyn Fn(Stage, u64, u64) + Sync),
 ) -> RunTransfer {
@@ -164,12 +165,12 @@ pub fn bake_run(
     }
     let cells: Vec<Cells> = fields.iter().map(|field| Cells::new(field, settings.shift)).collect();
     for medium in settings.media().0 {
-        indirect(fields, &cells, basis, medium, settings, rank(1), observe, &mut out);
+        indirect(fields, &cells, indirect_basis, medium, settings, rank(1), observe, &mut out);
     }
     let numbers = |frame: usize| {
         let nodes = out.direct.first().map_or(0, |d| d.frames[frame].0.len()) * basis.areas().len() * out.direct.len();
         let n = settings.bands() * settings.bands();
-        nodes + cells[frame].len() * basis.kind().len() * n * out.indirect.len()
+        nodes + cells[frame].len() * indirect_basis.kind().len() * n * out.indirect.len()
     };
     out.raw_bytes = (0..fields.len()).map(|frame| 4 * numbers(frame) as u64).collect();
     out

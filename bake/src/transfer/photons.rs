@@ -52,7 +52,7 @@ pub struct GreyMedium {
 /// How many photons, and of what.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PhotonSettings {
-    /// For each face of a cell on the border of the smoke's box and each basis light; 0 gives no indirect light.
+    /// For each face of a voxel on the border of the smoke's box and each basis light; 0 gives no indirect light.
     pub per_face: u32,
     /// Of the random numbers.
     pub seed: u64,
@@ -403,7 +403,7 @@ fn direction_in([a, b, c]: [DVec3; 3], [u, v]: [f32; 2]) -> (DVec3, f64) {
     (point / r, height / (r * r * r) * area / omega)
 }
 
-/// Corners of the box of cells with density, node space, and the faces of cells on its border.
+/// Corners of the box of cells with density, node space, and the faces of voxels on its border.
 fn active_box(field: &DensityField, cells: &Cells) -> ([DVec3; 2], u64) {
     let [bx, by, _] = cells.majorants.bricks;
     let (mut low, mut high) = ([usize::MAX; 3], [0usize; 3]);
@@ -420,7 +420,7 @@ fn active_box(field: &DensityField, cells: &Cells) -> ([DVec3; 2], u64) {
     let n = [0, 1, 2].map(|a| (high[a] - low[a]) as u64);
     let side = 1usize << cells.shift;
     let corner = |at: [usize; 3]| DVec3::from_array([0, 1, 2].map(|a| ((at[a] * side).min(field.dims[a] - 1)) as f64));
-    ([corner(low), corner(high)], 2 * (n[0] * n[1] + n[1] * n[2] + n[2] * n[0]))
+    ([corner(low), corner(high)], 2 * (n[0] * n[1] + n[1] * n[2] + n[2] * n[0]) << (2 * cells.shift))
 }
 
 #[cfg(test)]
@@ -462,7 +462,7 @@ mod tests {
             // Independent sets give the noise: mean and standard error of each cell.
             let runs: Vec<Vec<f64>> = (0..12)
                 .map(|seed| {
-                    let settings = PhotonSettings { seed, ..settings(60, 0) };
+                    let settings = PhotonSettings { seed, ..settings(4, 0) };
                     let (moments, _) =
                         Photons::new(&field, &cells, &basis, medium, settings).trace(0..kind.len(), &|_| ());
                     fluence(&moments, kind.len())
@@ -490,7 +490,7 @@ mod tests {
         let basis = LightBasis::new(BasisKind::Hat(42));
         let medium = GreyMedium { sigma_t: 1.0, albedo: 0.8, g: 0.3 };
         let total = |order| {
-            let photons = Photons::new(&field, &cells, &basis, medium, settings(40, order));
+            let photons = Photons::new(&field, &cells, &basis, medium, settings(10, order));
             let (moments, _) = photons.trace(0..42, &|_| ());
             let each = fluence(&moments, 42);
             each.iter().zip(&cells.mass).map(|(f, m)| f * m).sum::<f64>() / cells.mass.iter().sum::<f64>() / (4.0 * PI)
@@ -506,7 +506,7 @@ mod tests {
         for kind in [BasisKind::Discrete(42), BasisKind::Hat(42), BasisKind::Harmonics(3)] {
             let basis = LightBasis::new(kind);
             let medium = GreyMedium { sigma_t: 2.0, albedo: 0.9, g: 0.4 };
-            let settings = PhotonSettings { bands: 2, ..settings(3, 1) };
+            let settings = PhotonSettings { bands: 2, ..settings(1, 1) };
             let photons = Photons::new(&field, &cells, &basis, medium, settings);
             let whole = photons.trace(0..kind.len(), &|_| ()).0;
             let width = 4 * kind.len();
@@ -528,7 +528,7 @@ mod tests {
             let medium = GreyMedium { sigma_t: 2.0, albedo: 0.9, g: 0.0 };
             let with = |threads| {
                 let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-                let photons = Photons::new(&field, &cells, &basis, medium, settings(3, 1));
+                let photons = Photons::new(&field, &cells, &basis, medium, settings(1, 1));
                 pool.install(|| photons.trace(0..kind.len(), &|_| ()).0)
             };
             assert!(with(1) == with(3));
@@ -560,7 +560,7 @@ mod tests {
         let basis = LightBasis::new(BasisKind::Hat(42));
         let medium = GreyMedium { sigma_t: 1e6, albedo: 1.0, g: 0.0 };
         // About 1 in sqrt(20,000) of 2,000 photons is still inside after so many collisions.
-        let photons = Photons::new(&field, &cells, &basis, medium, settings(3, 1));
+        let photons = Photons::new(&field, &cells, &basis, medium, settings(1, 1));
         let (moments, traced) = photons.trace(0..42, &|_| ());
         assert!(moments.iter().all(|v| v.is_finite()) && traced.truncated > 0.0 && traced.truncated < 1.0);
     }

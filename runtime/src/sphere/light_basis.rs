@@ -50,6 +50,17 @@ impl BasisKind {
         false
     }
 
+    /// The same on a mesh of edges twice as long, down to 42 nodes; harmonics as they are. Light that was scattered is as
+    /// smooth in the light's direction as the phase function and the smoke make it: half the nodes a side are enough.
+    pub fn coarser(self) -> Self {
+        let fewer = |nodes: usize| ((nodes - 2) / 4 + 2).max(42);
+        match self {
+            Self::Discrete(nodes) => Self::Discrete(fewer(nodes)),
+            Self::Hat(nodes) => Self::Hat(fewer(nodes)),
+            Self::Harmonics(order) => Self::Harmonics(order),
+        }
+    }
+
     /// The kind of a name such as `dsf642`, `hat162` or `sh6`.
     pub fn of_name(name: &str) -> Option<Self> {
         let split = name.find(|c: char| c.is_ascii_digit())?;
@@ -313,6 +324,7 @@ mod tests {
         for kind in LOCAL.into_iter().chain([BasisKind::Harmonics(1), BasisKind::Harmonics(6)]) {
             assert_eq!(BasisKind::of_name(&kind.name()), Some(kind));
         }
+        assert_eq!(BasisKind::Hat(2562).coarser().coarser().coarser().coarser(), BasisKind::Hat(42));
         for bad in ["", "dsf", "642", "dsf12", "dsf643", "hat", "sh0", "sh7", "sh", "DSF642", "dsf642x"] {
             assert_eq!(BasisKind::of_name(bad), None, "{bad}");
         }

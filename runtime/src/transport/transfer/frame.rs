@@ -32,8 +32,10 @@ impl Clustered {
 pub struct FrameTransfer {
     /// The medium that it was baked for.
     pub medium: MediumParameters,
-    /// The basis of the lights.
+    /// The basis of the lights; direct light comes from the directions of its mesh.
     pub basis: Arc<LightBasis>,
+    /// That of indirect light.
+    pub indirect_basis: Arc<LightBasis>,
     /// Bands of what goes out indirectly: `bands^2` coefficients.
     pub bands: usize,
     /// Indirect cells have `2^shift` voxels a side.
@@ -44,7 +46,7 @@ pub struct FrameTransfer {
     pub indirect_of_channel: [usize; 3],
     /// Transmittance from each direction of the basis's mesh to each lit node ([`super::lit_nodes`]).
     pub direct: Vec<Clustered>,
-    /// What each cell ([`super::cells`]) sends out for each basis light, scattered twice or more:
+    /// What each cell ([`super::cells`]) sends out for each light of the indirect basis, scattered twice or more:
     /// `[light][l (l + 1) + m]` of `albedo g^l L_lm`.
     pub indirect: Vec<Clustered>,
 }

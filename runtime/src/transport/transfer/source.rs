@@ -104,7 +104,7 @@ impl TransferTransport {
                 Err(TransferError { part, found, expected: format!("{rows} rows of {length} numbers") })
             })
         };
-        let lights = transfer.basis.kind().len();
+        let lights = transfer.indirect_basis.kind().len();
         check("direct light", &transfer.direct, nodes.len(), transfer.basis.areas().len())?;
         check("indirect light", &transfer.indirect, cells.len(), lights * transfer.bands * transfer.bands)?;
         Ok(Self { transfer, nodes: Arc::new(nodes), cells: Arc::new(cells), settings, grid: None })
@@ -114,13 +114,9 @@ impl TransferTransport {
     pub fn light(&mut self, field: &DensityField, lights: &[Light]) -> TransferSource {
         let transfer = self.transfer.clone();
         let basis = &transfer.basis;
-        let coefficients = basis.coefficients(lights);
         let (suns, rest): (Vec<&Light>, Vec<&Light>) =
             lights.iter().partition(|l| self.settings.sharp_suns && matches!(l, Light::Directional { .. }));
-        let without_suns = match suns.is_empty() {
-            true => coefficients.clone(),
-            false => basis.coefficients(&rest.into_iter().cloned().collect::<Vec<_>>()),
-        };
+        let without_suns = basis.coefficients(&rest.into_iter().cloned().collect::<Vec<_>>());
         let irradiance: Vec<[f32; 3]> = (0..basis.areas().len())
             .map(|q| {
                 let radiance = match basis.kind() {
@@ -131,7 +127,7 @@ impl TransferTransport {
             })
             .collect();
         let suns = suns.into_iter().filter_map(|sun| self.sweep(field, sun)).collect();
-        let moments = moments(&transfer, &self.cells, &coefficients);
+        let moments = moments(&transfer, &self.cells, &transfer.indirect_basis.coefficients(lights));
         let mut source = TransferSource {
             nodes: self.nodes.clone(),
             cells: self.cells.clone(),
