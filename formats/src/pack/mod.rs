@@ -7,11 +7,13 @@
 //! | [`gaussians`] | Gaussians at rest: plain, or at 16 bits a parameter |
 //! | [`at_rest`] | a section's bytes at rest and resident |
 //! | [`encoded`] | a frame at rest, before it is in a pack |
-//! | [`transfer_record`] | what is said about precomputed transfer, and which sections it names |
+//! | [`transfer_record`] | what is said about precomputed transfer |
+//! | [`transfer_sections`] | which sections belong to it |
 //! | [`transfer_layout`] | bases and rows of transfer as bytes |
 //! | [`encoded_transfer`] | the transfer of a frame at rest, before it is in a pack |
 //! | [`writer`] | frames in, a file out |
 //! | [`reader`] | one frame out, without reading the others |
+//! | [`transfer_reader`] | the transfer of one frame out |
 //! | [`validate`] | the first thing that is wrong with a file |
 
 pub mod at_rest;
@@ -22,7 +24,9 @@ pub mod gaussians;
 pub mod reader;
 pub mod records;
 pub mod transfer_layout;
+mod transfer_reader;
 pub mod transfer_record;
+mod transfer_sections;
 mod validate;
 pub mod writer;
 mod zlib;

@@ -15,11 +15,11 @@ use super::container::{
 use super::records::{
     Codec, FrameRecord, MAX_RECORD_BYTES, ResidualKind, SectionRecord, SequenceRecord, SettingsRecord, decode,
 };
-use super::transfer_layout::{decode_bases, decode_rows, from_rest};
-use super::transfer_record::{TransferRecord, TransferSections, bytes_of_transfer, sections_of_transfer};
+use super::transfer_reader::PackTransfer;
+use super::transfer_record::TransferRecord;
+use super::transfer_sections::sections_of_transfer;
 use crate::gaussian::Gaussian;
 use crate::residual::{Residual, ResidualCodes};
-use crate::transfer::{Shape, TransferBases, TransferRows};
 use crate::{Error, Result};
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
@@ -47,10 +47,7 @@ pub struct Pack {
     sections: Vec<(usize, usize)>,
     /// The residual section read last: neighbouring frames share a tile.
     last: Mutex<Option<(usize, Arc<Residual>)>>,
-    /// The record of transfer, and the sections of each of its frames.
-    transfer: Option<(TransferRecord, Vec<TransferSections>)>,
-    /// The section of bases read last, and their shape: the frames of a run share them.
-    last_bases: Mutex<Option<(usize, Arc<TransferBases>, Shape)>>,
+    pub(super) transfer: Option<PackTransfer>,
 }
 
 /// The residual of one frame, in its resident layout.
@@ -128,13 +125,15 @@ impl Pack {
         let sections = sections_of_frames(path, &toc, &frames)?;
         check_chains(path, &toc, &sections)?;
         let transfer = match count(KIND_TRANSFER) {
-            0 => None,
-            _ => Some(decode::<TransferRecord>(path, "transfer", &record(KIND_TRANSFER)?)?),
+            // Without a record there are no sections either.
+            0 => sections_of_transfer(path, &toc, &[]).map(|_| None)?,
+            _ => {
+                let record: TransferRecord = decode(path, "transfer", &record(KIND_TRANSFER)?)?;
+                Some(PackTransfer::new(path, &toc, &frames, record)?)
+            }
         };
-        let transfer = transfer_of(path, &toc, &frames, transfer)?;
-        let (last, last_bases) = (Mutex::new(None), Mutex::new(None));
-        let path = path.to_owned();
-        Ok(Self { path, source, header, toc, sequence, settings, frames, sections, last, transfer, last_bases })
+        let last = Mutex::new(None);
+        Ok(Self { path: path.to_owned(), source, header, toc, sequence, settings, frames, sections, last, transfer })
     }
 
     /// The file's path.
@@ -229,64 +228,7 @@ impl Pack {
 
     /// What holds for the precomputed transfer, if the pack has any.
     pub fn transfer(&self) -> Option<&TransferRecord> {
-        self.transfer.as_ref().map(|(record, _)| record)
-    }
-
-    /// The bases of transfer of the run that frame `frame` (counted from 0) belongs to; fails if it has no transfer.
-    /// They are kept until those of another run are asked for.
-    pub fn transfer_bases(&self, frame: usize) -> Result<Arc<TransferBases>> {
-        let (record, place, sections) = self.transfer_of(frame)?;
-        Ok(self.bases(record, place, sections)?.0)
-    }
-
-    /// The rows of transfer of frame `frame` (counted from 0); fails if it has none. Every row has its cluster in the
-    /// bases of its run, and a weight for each of their directions.
-    pub fn transfer_rows(&self, frame: usize) -> Result<TransferRows> {
-        let (record, place, sections) = self.transfer_of(frame)?;
-        let (_, bases) = self.bases(record, place, sections)?;
-        let (of, what) = (format!("transfer.frames[{place}]"), format!("transfer.frames[{place}].rows"));
-        let rows = decode_rows(&self.path, &what, &self.transfer_bytes(&of, &what, &self.toc[sections.rows])?)?;
-        let shape = rows.check(&self.path, &what)?;
-        record.check_sets(&self.path, &what, &shape)?;
-        record.frames[place].check_rows(&self.path, &what, &shape)?;
-        shape.check_rows_by(&self.path, &what, &bases)?;
-        Ok(rows)
-    }
-
-    fn bases(
-        &self,
-        record: &TransferRecord,
-        place: usize,
-        sections: TransferSections,
-    ) -> Result<(Arc<TransferBases>, Shape)> {
-        let kept = self.last_bases.lock().unwrap_or_else(PoisonError::into_inner).clone();
-        if let Some((_, bases, shape)) = kept.filter(|(of, ..)| *of == sections.bases) {
-            return Ok((bases, shape));
-        }
-        let (of, what) = (format!("transfer.frames[{place}]"), format!("transfer.frames[{place}].bases"));
-        let bases = decode_bases(&self.path, &what, &self.transfer_bytes(&of, &what, &self.toc[sections.bases])?)?;
-        let shape = bases.check(&self.path, &what)?;
-        record.check_sets(&self.path, &what, &shape)?;
-        let bases = Arc::new(bases);
-        let keep = (sections.bases, bases.clone(), shape.clone());
-        *self.last_bases.lock().unwrap_or_else(PoisonError::into_inner) = Some(keep);
-        Ok((bases, shape))
-    }
-
-    fn transfer_of(&self, frame: usize) -> Result<(&TransferRecord, usize, TransferSections)> {
-        let Some((record, sections)) = &self.transfer else {
-            let found = format!("no transfer of frame {frame}");
-            return Err(Error::invalid(&self.path, "transfer", found, "a pack that was baked with transfer"));
-        };
-        let place = record.place(&self.path, frame)?;
-        Ok((record, place, sections[place]))
-    }
-
-    /// The resident bytes of a section of transfer: `what` of the frame `of`.
-    fn transfer_bytes(&self, of: &str, what: &str, section: &SectionRecord) -> Result<Vec<u8>> {
-        let bytes = self.section_bytes(of, section)?;
-        let codec = codec_of(&self.path, what, section)?;
-        from_rest(&self.path, what, bytes, codec, section.bytes_resident)
+        self.transfer.as_ref().map(PackTransfer::record)
     }
 
     fn section(&self, frame: usize) -> Result<(usize, usize)> {
@@ -312,32 +254,6 @@ impl Pack {
     pub(super) fn toc_offset(&self) -> u64 {
         self.header.toc_offset
     }
-}
-
-/// The record of transfer with the sections of its frames: each exactly once, with the bytes that it says.
-fn transfer_of(
-    path: &Path,
-    toc: &[SectionRecord],
-    frames: &[FrameRecord],
-    record: Option<TransferRecord>,
-) -> Result<Option<(TransferRecord, Vec<TransferSections>)>> {
-    let Some(record) = record else {
-        // Without a record there are no sections either.
-        sections_of_transfer(path, toc, &[])?;
-        return Ok(None);
-    };
-    record.check(path, frames)?;
-    let sections = sections_of_transfer(path, toc, &record.frames)?;
-    for (i, (f, (at_rest, resident))) in record.frames.iter().zip(bytes_of_transfer(toc, &sections)).enumerate() {
-        for (field, found, expected) in
-            [("bytes_at_rest", f.bytes_at_rest, at_rest), ("bytes_resident", f.bytes_resident, resident)]
-        {
-            if found != expected {
-                return Err(Error::invalid(path, format!("transfer.frames[{i}].{field}"), found, expected));
-            }
-        }
-    }
-    Ok(Some((record, sections)))
 }
 
 fn checked(path: &Path, what: &str, section: &SectionRecord, bytes: &[u8]) -> Result<()> {

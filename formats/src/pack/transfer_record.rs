@@ -1,14 +1,12 @@
-//! What is said about precomputed transfer, and which sections belong to it.
+//! What is said about precomputed transfer.
 //!
 //! The record belongs to one medium: rows and bases hold its extinction, albedo and phase function. Frames that follow
-//! one another in the record and share bases are a *run*; its bases are one section, which spans the run.
+//! one another in the record and share bases are a *run*.
 
-use super::container::{KIND_TRANSFER_BASES, KIND_TRANSFER_ROWS, kind_name};
-use super::records::{FrameRecord, SectionRecord, number};
+use super::records::{FrameRecord, number};
 use crate::transfer::{MAX_SETS, Shape};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
 use std::path::Path;
 
 /// Most bands of what goes out indirectly.
@@ -167,78 +165,6 @@ impl TransferFrameRecord {
     }
 }
 
-/// The sections of the transfer of a frame: which sections of the table of contents.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct TransferSections {
-    /// The bases of its run.
-    pub(super) bases: usize,
-    /// Its rows.
-    pub(super) rows: usize,
-}
-
-/// The sections of each of `frames`, which were checked: each exactly once, and no others of their kinds.
-pub(super) fn sections_of_transfer(
-    path: &Path,
-    toc: &[SectionRecord],
-    frames: &[TransferFrameRecord],
-) -> Result<Vec<TransferSections>> {
-    let mut left = BTreeMap::new();
-    for (i, s) in toc.iter().enumerate().filter(|(_, s)| matches!(s.kind, KIND_TRANSFER_BASES | KIND_TRANSFER_ROWS)) {
-        if left.insert((s.kind, s.first_frame), i).is_some() {
-            let found = format!("more {} of frame {}", kind_name(s.kind), s.first_frame);
-            return Err(Error::invalid(path, format!("sections[{i}].first_frame"), found, "one section"));
-        }
-    }
-    let mut take = |place: usize, kind: u32, first: u32, span: u32| {
-        let what = format!("transfer.frames[{place}].{}", kind_name(kind));
-        let Some(i) = left.remove(&(kind, first)) else {
-            return Err(Error::invalid(path, what, "no section", format!("one from frame {first}")));
-        };
-        match toc[i].frames == span {
-            true => Ok(i),
-            false => Err(Error::invalid(path, what, format!("a section of {} frames", toc[i].frames), span)),
-        }
-    };
-    let mut sections = vec![];
-    for run in frames.chunk_by(|a, b| a.first_of_run == b.first_of_run) {
-        let (first, last) = (run[0].frame, run[run.len() - 1].frame);
-        let bases = take(sections.len(), KIND_TRANSFER_BASES, first, last - first + 1)?;
-        for frame in run {
-            sections.push(TransferSections { bases, rows: take(sections.len(), KIND_TRANSFER_ROWS, frame.frame, 1)? });
-        }
-    }
-    match left.into_values().min() {
-        None => Ok(sections),
-        Some(i) => {
-            let found = format!("{} of frame {}", kind_name(toc[i].kind), toc[i].first_frame);
-            Err(Error::invalid(path, format!("sections[{i}]"), found, "a section that the transfer record names"))
-        }
-    }
-}
-
-/// Bytes at rest and resident of each frame: its rows, and its even share of its run's bases.
-pub(super) fn bytes_of_transfer(toc: &[SectionRecord], sections: &[TransferSections]) -> Vec<(u64, u64)> {
-    let mut bytes = vec![];
-    for run in sections.chunk_by(|a, b| a.bases == b.bases) {
-        let bases = &toc[run[0].bases];
-        for (i, frame) in run.iter().enumerate() {
-            let rows = &toc[frame.rows];
-            let share = |total: u64| even_share(total, run.len(), i);
-            bytes.push((
-                rows.bytes_at_rest.saturating_add(share(bases.bytes_at_rest)),
-                rows.bytes_resident.saturating_add(share(bases.bytes_resident)),
-            ));
-        }
-    }
-    bytes
-}
-
-/// Part `i` of `total` in `n` parts that differ by one at most and add up to it.
-pub(super) fn even_share(total: u64, n: usize, i: usize) -> u64 {
-    let (n, i) = (n as u64, i as u64);
-    total / n + u64::from(i < total % n)
-}
-
 fn sets_of(path: &Path, name: &str, sets: [u32; 3]) -> Result<()> {
     let largest = sets.into_iter().max().unwrap_or(0);
     match (largest as usize) < MAX_SETS && (0..largest).all(|set| sets.contains(&set)) {
@@ -374,15 +300,6 @@ pub(super) mod tests {
         let frames = vec![FrameRecord::default(); 6];
         let message = some_record().check(path(), &frames).unwrap_err().to_string();
         assert!(message.starts_with("p: transfer.frames[0].voxels: found 20, expected at most 0, "), "{message}");
-    }
-
-    #[test]
-    fn shares_are_even_and_add_up() {
-        for (total, n) in [(0, 1), (7, 3), (9, 3), (2, 5), (u64::MAX, 6)] {
-            let shares: Vec<u64> = (0..n).map(|i| even_share(total, n, i)).collect();
-            assert_eq!(shares.iter().sum::<u64>(), total);
-            assert!(shares[0] - shares[n - 1] <= 1, "{shares:?}");
-        }
     }
 
     #[test]
