@@ -9,7 +9,7 @@ use crate::{answer, failure::Failure};
 use serde_json::{Value, json};
 use smoke_formats::Error;
 use smoke_formats::pack::container::VERSION;
-use smoke_formats::pack::{FrameRecord, Pack, Promise, ResidualKind};
+use smoke_formats::pack::{FrameRecord, Pack, Promise, ResidualKind, TransferFrameRecord, TransferRecord};
 use std::fmt::Write;
 
 /// Opens the pack and prints what it says.
@@ -50,6 +50,32 @@ impl Totals {
 
     fn bits_a_voxel(&self, bytes: u64) -> f64 {
         8.0 * bytes as f64 / self.active_voxels as f64
+    }
+}
+
+/// Sums and largest errors over the frames with transfer.
+struct TransferTotals {
+    bytes_at_rest: u64,
+    bytes_resident: u64,
+    raw_bytes: u64,
+    direct_error: f64,
+    indirect_error: f64,
+    truncated: f64,
+}
+
+impl TransferTotals {
+    fn of(record: &TransferRecord) -> Self {
+        // Saturating: a record may claim any number of bytes.
+        let sum = |field: fn(&TransferFrameRecord) -> u64| record.frames.iter().map(field).fold(0, u64::saturating_add);
+        let most = |field: fn(&TransferFrameRecord) -> f64| record.frames.iter().map(field).fold(0.0, f64::max);
+        Self {
+            bytes_at_rest: sum(|f| f.bytes_at_rest),
+            bytes_resident: sum(|f| f.bytes_resident),
+            raw_bytes: sum(|f| f.raw_bytes),
+            direct_error: most(|f| f.direct_error),
+            indirect_error: most(|f| f.indirect_error),
+            truncated: most(|f| f.truncated),
+        }
     }
 }
 
@@ -130,7 +156,41 @@ pub fn as_json(pack: &Pack, seconds: Option<&[Seconds]>) -> Result<Value, Failur
             "file_bytes": pack.file_bytes(),
             "seconds": seconds.map(total_seconds),
         },
+        "transfer": pack.transfer().map(|record| transfer_json(pack, record)),
     }))
+}
+
+/// The part on precomputed transfer; frames are told by the source's numbers.
+fn transfer_json(pack: &Pack, record: &TransferRecord) -> Value {
+    let totals = TransferTotals::of(record);
+    let number = |frame: u32| pack.frames()[frame as usize].frame;
+    let frames = record.frames.iter().map(|f| {
+        json!({
+            "frame": number(f.frame),
+            "first_of_run": number(f.first_of_run),
+            "voxels": f.voxels,
+            "cells": f.cells,
+            "compression_error": { "direct": f.direct_error, "indirect": f.indirect_error },
+            "truncated": f.truncated,
+            "raw_bytes": f.raw_bytes,
+            "bytes_at_rest": f.bytes_at_rest,
+            "bytes_resident": f.bytes_resident,
+        })
+    });
+    json!({
+        "basis": record.basis,
+        "frames": record.frames.iter().map(|f| number(f.frame)).collect::<Vec<_>>(),
+        "medium": { "sigma_t": record.sigma_t, "albedo": record.albedo, "g": record.g },
+        "bands": record.bands,
+        "cell_shift": record.cell_shift,
+        "photons": record.photons,
+        "bytes_at_rest": totals.bytes_at_rest,
+        "bytes_resident": totals.bytes_resident,
+        "raw_bytes": totals.raw_bytes,
+        "compression_error": { "direct": totals.direct_error, "indirect": totals.indirect_error },
+        "truncated": totals.truncated,
+        "per_frame": frames.collect::<Vec<_>>(),
+    })
 }
 
 /// One line: what `bake` says of the pack it wrote.
@@ -195,6 +255,24 @@ fn as_text(pack: &Pack, seconds: Option<Vec<Seconds>>) -> String {
         bits(totals.bytes_at_rest, totals.active_voxels),
         bits(totals.bytes_resident, totals.active_voxels),
     );
+    if let Some(record) = pack.transfer() {
+        let totals = TransferTotals::of(record);
+        let _ = writeln!(
+            out,
+            "transfer: {} of {} frames, basis {}, sigma_t {:?}, albedo {:?}, g {}; {} bytes at rest, {} resident; \
+             compression is off by {} direct, {} indirect at most",
+            record.frames.len(),
+            frames.len(),
+            record.basis,
+            record.sigma_t,
+            record.albedo,
+            record.g,
+            totals.bytes_at_rest,
+            totals.bytes_resident,
+            small(totals.direct_error),
+            small(totals.indirect_error),
+        );
+    }
     out
 }
 
@@ -225,7 +303,9 @@ fn table(rows: &[Vec<String>]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::small_pack;
+    use crate::testing::{small_pack, small_pack_with_transfer};
+    use smoke_formats::pack::container::{KIND_TRANSFER_BASES, KIND_TRANSFER_ROWS};
+    use smoke_formats::pack::validate;
 
     fn packed(frames: &[i32]) -> (tempfile::TempDir, Pack) {
         let folder = tempfile::tempdir().unwrap();
@@ -273,6 +353,50 @@ mod tests {
         ];
         assert_eq!(keys, expected);
         assert_eq!((&json["frames"][0]["seconds"], &json["totals"]["seconds"]), (&Value::Null, &Value::Null));
+    }
+
+    #[test]
+    fn transfer_is_null_or_has_exactly_the_keys_that_are_promised() {
+        let (_folder, pack) = packed(&[7]);
+        assert_eq!(as_json(&pack, None).unwrap()["transfer"], Value::Null);
+        assert!(!as_text(&pack, None).contains("transfer"));
+
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("transfer.smoke");
+        small_pack_with_transfer(&path);
+        let pack = Pack::open(&path).unwrap();
+        let json = as_json(&pack, None).unwrap();
+        let transfer = json["transfer"].as_object().unwrap();
+        let keys: Vec<&str> = transfer.keys().map(String::as_str).collect();
+        let expected = [
+            "basis",
+            "frames",
+            "medium",
+            "bands",
+            "cell_shift",
+            "photons",
+            "bytes_at_rest",
+            "bytes_resident",
+            "raw_bytes",
+            "compression_error",
+            "truncated",
+            "per_frame",
+        ];
+        assert_eq!(keys, expected);
+        // By the source's numbers; the largest errors; sums of bytes.
+        assert_eq!(transfer["frames"], json!([1001, 1004]));
+        assert_eq!(transfer["per_frame"][1]["first_of_run"], 1001);
+        assert_eq!(transfer["compression_error"], json!({ "direct": 0.25, "indirect": 0.5 }));
+        assert_eq!((&transfer["truncated"], &transfer["raw_bytes"]), (&json!(0.125), &json!(300)));
+        assert_eq!(transfer["medium"], json!({ "sigma_t": [2.0, 2.0, 2.0], "albedo": [0.5, 0.5, 0.5], "g": 0.0 }));
+        let sections = pack.sections().iter().filter(|s| s.kind == KIND_TRANSFER_BASES || s.kind == KIND_TRANSFER_ROWS);
+        assert_eq!(transfer["bytes_at_rest"], sections.map(|s| s.bytes_at_rest).sum::<u64>());
+        let text = as_text(&pack, None);
+        let line = "transfer: 2 of 3 frames, basis sh6, sigma_t [2.0, 2.0, 2.0], albedo [0.5, 0.5, 0.5], g 0; ";
+        let last = text.lines().last().unwrap();
+        assert!(last.starts_with(line), "{text}");
+        assert!(last.ends_with("compression is off by 2.500e-1 direct, 5.000e-1 indirect at most"), "{text}");
+        assert_eq!(validate(&path), []);
     }
 
     #[test]

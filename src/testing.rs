@@ -2,9 +2,13 @@
 
 use crate::staging::Stage;
 use smoke_formats::gaussian::Gaussian;
-use smoke_formats::pack::{AtRest, FrameData, FrameRecord, Promise, SequenceRecord, SettingsRecord, write};
+use smoke_formats::pack::{
+    AtRest, Codec, FrameData, FrameRecord, Promise, SequenceRecord, SettingsRecord, TransferFrameRecord,
+    TransferRecord, write,
+};
 use smoke_formats::residual::ResidualCodes;
 use smoke_formats::scene::Scene;
+use smoke_formats::transfer::{Bases, Rows, TransferBases, TransferRows};
 use smoke_formats::volume::VoxelMask;
 use smoke_runtime::camera::Camera;
 use smoke_runtime::transport::medium::MediumParameters;
@@ -13,6 +17,34 @@ use std::path::Path;
 /// Writes a pack of the given frames, 4 x 3 x 2 voxels of 0.5 world units at index (10, -2, 0), every other voxel in the
 /// support, three Gaussians a frame, codes that differ from frame to frame.
 pub fn small_pack(path: &Path, frames: &[i32], step: f32) {
+    write_small_pack(path, frames, step, None);
+}
+
+/// The small pack of frames 1001, 1002 and 1004; the first and the last are a run with transfer, all of it zero.
+pub fn small_pack_with_transfer(path: &Path) {
+    let frame = |frame: u32, direct_error: f64, indirect_error: f64| TransferFrameRecord {
+        frame,
+        voxels: 12 + u64::from(frame),
+        cells: 2,
+        direct_error,
+        indirect_error,
+        truncated: 0.125,
+        raw_bytes: 150,
+        ..TransferFrameRecord::default()
+    };
+    let record = TransferRecord {
+        sigma_t: [2.0; 3],
+        albedo: [0.5; 3],
+        bands: 3,
+        photons: 8,
+        basis: "sh6".into(),
+        frames: vec![frame(0, 0.25, 0.0), frame(2, 0.0, 0.5)],
+        ..TransferRecord::default()
+    };
+    write_small_pack(path, &[1001, 1002, 1004], 0.01, Some(&record));
+}
+
+fn write_small_pack(path: &Path, frames: &[i32], step: f32, transfer: Option<&TransferRecord>) {
     let (origin, dims) = ([10, -2, 0], [4, 3, 2]);
     let gaussian = |i: usize| Gaussian { center: [0.3 * i as f32, 0.2, 0.1], radius: 0.4, weight: 0.25 };
     let gaussians: Vec<Gaussian> = (0..3).map(gaussian).collect();
@@ -38,7 +70,16 @@ pub fn small_pack(path: &Path, frames: &[i32], step: f32) {
                 FrameRecord { frame, fit_error: 0.02, max_error, psnr_db: 47.5, step, ..FrameRecord::default() };
             writer.push_rank(&FrameData { record, gaussians: &gaussians, codes: &codes }, AtRest::RAW)?;
         }
-        writer.finish(&sequence, &settings)
+        for (i, frame) in transfer.iter().flat_map(|record| &record.frames).enumerate() {
+            let bases = || vec![Bases { length: 1, clusters: 1, terms: 0, values: vec![Default::default()] }];
+            let rows = |count: u64| vec![Rows { ids: vec![0; count as usize], weights: vec![] }];
+            if i == 0 {
+                writer.push_transfer_bases(0, 3, &TransferBases { direct: bases(), indirect: bases() }, Codec::Raw)?;
+            }
+            let rows = TransferRows { direct: rows(frame.voxels), indirect: rows(frame.cells) };
+            writer.push_transfer_rows(frame.frame as usize, &rows, Codec::Raw)?;
+        }
+        writer.finish(&sequence, &settings, transfer)
     });
     filled.unwrap();
 }

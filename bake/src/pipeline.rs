@@ -291,7 +291,7 @@ fn assemble(
             let seconds = start.elapsed().as_secs_f64();
             observe(Event::Tile { frames: tile.iter().map(|f| f.number).collect(), seconds });
         }
-        writer.finish(sequence, &SettingsRecord { json: settings_json.to_owned() })
+        writer.finish(sequence, &SettingsRecord { json: settings_json.to_owned() }, None)
     });
     match failed {
         Some(error) => Err(error),

@@ -17,6 +17,7 @@ pub mod residual;
 pub mod scene;
 pub mod sequence;
 pub mod toml_text;
+pub mod transfer;
 pub mod vdb;
 pub mod volume;
 pub mod volume_file;

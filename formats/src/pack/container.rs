@@ -40,6 +40,12 @@ pub const KIND_GAUSSIANS: u32 = 4;
 pub const KIND_RANK: u32 = 5;
 /// The residual of a tile of frames, see [`crate::residual::hash`].
 pub const KIND_HASH: u32 = 6;
+/// A [`super::TransferRecord`]; only in packs with transfer, as are the kinds after it.
+pub const KIND_TRANSFER: u32 = 7;
+/// The bases that a run of frames shares, see [`crate::transfer`].
+pub const KIND_TRANSFER_BASES: u32 = 8;
+/// The rows of one frame.
+pub const KIND_TRANSFER_ROWS: u32 = 9;
 
 /// The fixed header.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -138,6 +144,9 @@ pub fn kind_name(kind: u32) -> &'static str {
         KIND_GAUSSIANS => "gaussians",
         KIND_RANK => "rank",
         KIND_HASH => "hash",
+        KIND_TRANSFER => "transfer",
+        KIND_TRANSFER_BASES => "bases",
+        KIND_TRANSFER_ROWS => "rows",
         _ => "unknown",
     }
 }
@@ -178,11 +187,12 @@ pub fn decode_toc(path: &Path, header: &Header, bytes: &[u8]) -> Result<Vec<Sect
 /// A section's codec, if its kind is known and may have it.
 pub fn codec_of(path: &Path, what: &str, section: &SectionRecord) -> Result<Codec> {
     let allowed: &[Codec] = match section.kind {
-        KIND_SEQUENCE | KIND_SETTINGS | KIND_FRAMES => &[Codec::Raw],
+        KIND_SEQUENCE | KIND_SETTINGS | KIND_FRAMES | KIND_TRANSFER => &[Codec::Raw],
         KIND_GAUSSIANS => &[Codec::Raw, Codec::Deflate, Codec::Snapped],
         KIND_RANK => &[Codec::Raw, Codec::Coded, Codec::Deflate, Codec::CodedAfter],
         KIND_HASH => &[Codec::Raw, Codec::Coded, Codec::Deflate],
-        _ => return Err(Error::invalid(path, format!("{what}.kind"), section.kind, "1 to 6")),
+        KIND_TRANSFER_BASES | KIND_TRANSFER_ROWS => &[Codec::Raw, Codec::Deflate],
+        _ => return Err(Error::invalid(path, format!("{what}.kind"), section.kind, "1 to 9")),
     };
     allowed.iter().copied().find(|&c| c as u32 == section.codec).ok_or_else(|| {
         let expected = format!("a codec of {}: {allowed:?}", kind_name(section.kind));

@@ -12,26 +12,27 @@ fn path() -> &'static Path {
     Path::new("p")
 }
 
-fn findings(bytes: &[u8]) -> Vec<Finding> {
+pub(super) fn findings(bytes: &[u8]) -> Vec<Finding> {
     validate_bytes(path(), bytes.to_vec())
 }
 
 /// Reads all there is: the pack is refused, or every frame gives an error or an answer.
-fn read_all(bytes: &[u8]) {
+pub(super) fn read_all(bytes: &[u8]) {
     if let Ok(pack) = Pack::from_bytes(path(), bytes.to_vec()) {
         for frame in 0..pack.frames().len() {
             drop(pack.gaussians(frame));
             drop(pack.residual(frame).and_then(|r| r.codes()));
+            drop(pack.transfer_rows(frame));
         }
     }
 }
 
-fn sections(bytes: &[u8]) -> Vec<SectionRecord> {
+pub(super) fn sections(bytes: &[u8]) -> Vec<SectionRecord> {
     Pack::from_bytes(path(), bytes.to_vec()).unwrap().sections().to_vec()
 }
 
 /// Makes all checksums right again after the bytes were changed: damage becomes malice.
-fn reseal(bytes: &mut [u8], sections: &[SectionRecord]) {
+pub(super) fn reseal(bytes: &mut [u8], sections: &[SectionRecord]) {
     let toc_at = u64::from_le_bytes(bytes[24..32].try_into().unwrap()) as usize;
     for (i, s) in sections.iter().enumerate() {
         let checksum = xxh3_64(&bytes[s.offset as usize..(s.offset + s.bytes_at_rest) as usize]);

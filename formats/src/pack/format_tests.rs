@@ -57,6 +57,15 @@ pub(super) fn sample() -> Sample {
 }
 
 pub(super) fn pack_bytes(sample: &Sample, at_rest: AtRest) -> Vec<u8> {
+    pack_bytes_with(sample, at_rest, |_| None)
+}
+
+/// `more` pushes what the frames do not have.
+pub(super) fn pack_bytes_with(
+    sample: &Sample,
+    at_rest: AtRest,
+    more: impl FnOnce(&mut PackWriter<&mut Cursor<Vec<u8>>>) -> Option<TransferRecord>,
+) -> Vec<u8> {
     let mut bytes = Cursor::new(vec![]);
     let mut writer = PackWriter::new(Path::new("p"), &mut bytes).unwrap();
     let data: Vec<FrameData> = sample
@@ -68,7 +77,8 @@ pub(super) fn pack_bytes(sample: &Sample, at_rest: AtRest) -> Vec<u8> {
     ranks.iter().for_each(|frame| writer.push_rank(frame, at_rest).unwrap());
     let codes: Vec<ResidualCodes> = tile.iter().map(|f| f.codes.clone()).collect();
     writer.push_tile(tile, &trivial(&codes), at_rest).unwrap();
-    let length = writer.finish(&sample.sequence, &sample.settings).unwrap();
+    let transfer = more(&mut writer);
+    let length = writer.finish(&sample.sequence, &sample.settings, transfer.as_ref()).unwrap();
     assert_eq!(length, bytes.get_ref().len() as u64);
     bytes.into_inner()
 }
@@ -79,7 +89,7 @@ pub(super) fn every_way() -> impl Iterator<Item = AtRest> {
     gaussians.into_iter().flat_map(move |g| residual.map(|r| AtRest { gaussians: g, residual: r }))
 }
 
-fn assert_holds(pack: &Pack, sample: &Sample) {
+pub(super) fn assert_holds(pack: &Pack, sample: &Sample) {
     assert_eq!((pack.sequence(), pack.settings()), (&sample.sequence, &sample.settings));
     assert_eq!(pack.frames().len(), sample.frames.len());
     // Not in order: a frame does not need the ones before it.
@@ -119,14 +129,14 @@ fn a_pack_on_disk_appears_whole_or_not_at_all() {
     let bad = FrameRecord { step: f32::NAN, ..*record };
     let broken = write(&path, |mut writer| {
         writer.push_rank(&FrameData { record: bad, ..frame.clone() }, AtRest::SMALLEST)?;
-        writer.finish(&sample.sequence, &sample.settings)
+        writer.finish(&sample.sequence, &sample.settings, None)
     });
     let message = broken.unwrap_err().to_string();
     assert!(message.contains("frames[0].step: found NaN, expected above 0"), "{message}");
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
     let bytes = write(&path, |mut writer| {
         writer.push_rank(&frame, AtRest::SMALLEST)?;
-        writer.finish(&sample.sequence, &sample.settings)
+        writer.finish(&sample.sequence, &sample.settings, None)
     });
     let pack = Pack::open(&path).unwrap();
     assert_eq!((pack.file_bytes(), pack.frames().len()), (bytes.unwrap(), 1));
@@ -167,7 +177,7 @@ fn rows(heading: &str) -> Vec<(usize, Option<usize>, String)> {
 }
 
 /// Every row must name the next field, lie right after the row before it, and hold the field's bytes.
-fn assert_table(heading: &str, bytes: &[u8], fields: &[(&str, Vec<u8>)]) -> usize {
+pub(super) fn assert_table(heading: &str, bytes: &[u8], fields: &[(&str, Vec<u8>)]) -> usize {
     let rows = rows(heading);
     assert_eq!(rows.iter().map(|r| r.2.as_str()).collect::<Vec<_>>(), fields.iter().map(|f| f.0).collect::<Vec<_>>());
     let mut next = 0;
@@ -186,11 +196,11 @@ fn le<const N: usize, T: Copy>(values: &[T], bytes: impl Fn(T) -> [u8; N]) -> Ve
     values.iter().flat_map(|&v| bytes(v)).collect()
 }
 
-fn u32s(values: &[u32]) -> Vec<u8> {
+pub(super) fn u32s(values: &[u32]) -> Vec<u8> {
     le(values, u32::to_le_bytes)
 }
 
-fn u64s(values: &[u64]) -> Vec<u8> {
+pub(super) fn u64s(values: &[u64]) -> Vec<u8> {
     le(values, u64::to_le_bytes)
 }
 
@@ -198,11 +208,11 @@ fn i32s(values: &[i32]) -> Vec<u8> {
     le(values, i32::to_le_bytes)
 }
 
-fn f32s(values: &[f32]) -> Vec<u8> {
+pub(super) fn f32s(values: &[f32]) -> Vec<u8> {
     le(values, f32::to_le_bytes)
 }
 
-fn f64s(values: &[f64]) -> Vec<u8> {
+pub(super) fn f64s(values: &[f64]) -> Vec<u8> {
     le(values, f64::to_le_bytes)
 }
 

@@ -1,6 +1,6 @@
 //! One frame out of a pack, without reading the others.
 //!
-//! Opening reads header, table of contents and the three records, and checks that every frame has its sections. A frame
+//! Opening reads header, table of contents and the records, and checks that every frame has its sections. A frame
 //! costs one read of its Gaussians and one of its residual; a tile of frames is read whole and kept until another
 //! section is asked for. Every section's checksum is verified each time it is read.
 //!
@@ -9,12 +9,15 @@
 
 use super::at_rest::{decode_gaussians, decode_hash, decode_rank};
 use super::container::{
-    HEADER_BYTES, Header, KIND_FRAMES, KIND_GAUSSIANS, KIND_HASH, KIND_RANK, KIND_SEQUENCE, KIND_SETTINGS, codec_of,
-    decode_toc, kind_name,
+    HEADER_BYTES, Header, KIND_FRAMES, KIND_GAUSSIANS, KIND_HASH, KIND_RANK, KIND_SEQUENCE, KIND_SETTINGS,
+    KIND_TRANSFER, codec_of, decode_toc, kind_name,
 };
 use super::records::{
     Codec, FrameRecord, MAX_RECORD_BYTES, ResidualKind, SectionRecord, SequenceRecord, SettingsRecord, decode,
 };
+use super::transfer_reader::PackTransfer;
+use super::transfer_record::TransferRecord;
+use super::transfer_sections::sections_of_transfer;
 use crate::gaussian::Gaussian;
 use crate::residual::{Residual, ResidualCodes};
 use crate::{Error, Result};
@@ -44,6 +47,7 @@ pub struct Pack {
     sections: Vec<(usize, usize)>,
     /// The residual section read last: neighbouring frames share a tile.
     last: Mutex<Option<(usize, Arc<Residual>)>>,
+    pub(super) transfer: Option<PackTransfer>,
 }
 
 /// The residual of one frame, in its resident layout.
@@ -94,12 +98,12 @@ impl Pack {
         };
         small(header.toc_bytes, "header.toc_bytes")?;
         let toc = decode_toc(path, &header, &read(header.toc_offset, header.toc_bytes, "toc")?)?;
+        let count = |kind: u32| toc.iter().filter(|s| s.kind == kind).count();
         let record = |kind: u32| -> Result<Vec<u8>> {
             let what = kind_name(kind);
             let mut found = toc.iter().filter(|s| s.kind == kind);
             let (Some(section), None) = (found.next(), found.next()) else {
-                let count = toc.iter().filter(|s| s.kind == kind).count();
-                return Err(Error::invalid(path, format!("sections: {what}"), count, "1"));
+                return Err(Error::invalid(path, format!("sections: {what}"), count(kind), "1"));
             };
             if (section.first_frame, section.frames, section.bytes_resident) != (0, 0, section.bytes_at_rest) {
                 let found = format!("{section:?}");
@@ -120,8 +124,16 @@ impl Pack {
         }
         let sections = sections_of_frames(path, &toc, &frames)?;
         check_chains(path, &toc, &sections)?;
+        let transfer = match count(KIND_TRANSFER) {
+            // Without a record there are no sections either.
+            0 => sections_of_transfer(path, &toc, &[]).map(|_| None)?,
+            _ => {
+                let record: TransferRecord = decode(path, "transfer", &record(KIND_TRANSFER)?)?;
+                Some(PackTransfer::new(path, &toc, &frames, record)?)
+            }
+        };
         let last = Mutex::new(None);
-        Ok(Self { path: path.to_owned(), source, header, toc, sequence, settings, frames, sections, last })
+        Ok(Self { path: path.to_owned(), source, header, toc, sequence, settings, frames, sections, last, transfer })
     }
 
     /// The file's path.
@@ -212,6 +224,11 @@ impl Pack {
             return Err(Error::invalid(&self.path, what, record.active_voxels, active));
         }
         Ok(FrameResidual { residual, frame: local })
+    }
+
+    /// What holds for the precomputed transfer, if the pack has any.
+    pub fn transfer(&self) -> Option<&TransferRecord> {
+        self.transfer.as_ref().map(PackTransfer::record)
     }
 
     fn section(&self, frame: usize) -> Result<(usize, usize)> {

@@ -240,7 +240,7 @@ impl FrameRecord {
     }
 }
 
-fn number(path: &Path, what: &str, v: f64, good: impl Fn(f64) -> bool, expected: &str) -> Result<()> {
+pub(super) fn number(path: &Path, what: &str, v: f64, good: impl Fn(f64) -> bool, expected: &str) -> Result<()> {
     match good(v) {
         true => Ok(()),
         false => Err(Error::invalid(path, what, v, expected)),

@@ -2,7 +2,7 @@
 //!
 //! Order: magic, version, lengths, checksum, table of contents, kinds and codecs, places, records (these are what
 //! opening checks); then the zeros between sections; then each frame's Gaussians and residual, where a layout must be
-//! the one that its codes give, to the byte.
+//! the one that its codes give, to the byte; then each frame's transfer.
 
 use super::container::HEADER_BYTES;
 use super::reader::Pack;
@@ -33,7 +33,8 @@ impl From<Error> for Finding {
     }
 }
 
-/// What is wrong with the pack at `path`: nothing for a good one. Each frame adds at most one finding.
+/// What is wrong with the pack at `path`: nothing for a good one. Each frame adds at most one finding, and its
+/// transfer one.
 pub fn validate(path: &Path) -> Vec<Finding> {
     match Pack::open(path) {
         Ok(pack) => check(&pack),
@@ -52,7 +53,9 @@ pub fn validate_bytes(path: &Path, bytes: Vec<u8>) -> Vec<Finding> {
 fn check(pack: &Pack) -> Vec<Finding> {
     let gaps = check_gaps(pack);
     let frames = (0..pack.frames().len()).map(|frame| check_frame(pack, frame));
-    std::iter::once(gaps).chain(frames).filter_map(Result::err).map(Finding::from).collect()
+    let transfer = pack.transfer().into_iter().flat_map(|record| &record.frames);
+    let transfer = transfer.map(|frame| pack.transfer_rows(frame.frame as usize).map(drop));
+    std::iter::once(gaps).chain(frames).chain(transfer).filter_map(Result::err).map(Finding::from).collect()
 }
 
 fn check_gaps(pack: &Pack) -> Result<()> {

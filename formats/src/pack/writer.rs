@@ -6,13 +6,19 @@
 use super::at_rest::encode_hash;
 use super::container::{
     ALIGNMENT, HEADER_BYTES, Header, KIND_FRAMES, KIND_GAUSSIANS, KIND_HASH, KIND_RANK, KIND_SEQUENCE, KIND_SETTINGS,
+    KIND_TRANSFER, KIND_TRANSFER_BASES, KIND_TRANSFER_ROWS,
 };
 use super::encoded::{AtRest, EncodedFrame, FrameData};
+use super::encoded_transfer::{EncodedSection, EncodedTransfer};
 use super::gaussians::GAUSSIAN_BYTES;
 use super::records::{Codec, FrameRecord, ResidualKind, SectionRecord, SequenceRecord, SettingsRecord, encode};
+use super::transfer_record::TransferRecord;
+use super::transfer_sections::{bytes_of_transfer, even_share, sections_of_transfer};
 use crate::residual::ResidualCodes;
 use crate::residual::hash::{HashTable, MAX_FRAMES};
+use crate::transfer::{Shape, TransferBases, TransferRows};
 use crate::{Error, Result};
+use std::collections::BTreeMap;
 use std::io::{BufWriter, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use xxhash_rust::xxh3::xxh3_64;
@@ -30,13 +36,22 @@ pub struct PackWriter<W> {
     position: u64,
     toc: Vec<SectionRecord>,
     frames: Vec<FrameRecord>,
+    /// What was pushed of transfer, by its place in `toc`.
+    transfer: BTreeMap<usize, Shape>,
 }
 
 impl<W: Write + Seek> PackWriter<W> {
     /// A writer at the start of `out`; `path` is named in errors.
     pub fn new(path: &Path, mut out: W) -> Result<Self> {
         out.write_all(&[0; HEADER_BYTES as usize]).map_err(|e| Error::io(path, e))?;
-        Ok(Self { out, path: path.to_owned(), position: HEADER_BYTES, toc: vec![], frames: vec![] })
+        Ok(Self {
+            out,
+            path: path.to_owned(),
+            position: HEADER_BYTES,
+            toc: vec![],
+            frames: vec![],
+            transfer: BTreeMap::new(),
+        })
     }
 
     /// Frames pushed so far.
@@ -83,10 +98,7 @@ impl<W: Write + Seek> PackWriter<W> {
         let codes: Vec<ResidualCodes> = tile.iter().map(|f| f.codes.clone()).collect();
         let (bytes, resident) = encode_hash(&self.path, &codes, table, at_rest.residual)?;
         self.section(KIND_HASH, at_rest.residual, first..first + tile.len() as u32, &bytes, resident)?;
-        let share = |total: u64, i: usize| {
-            let (n, i) = (tile.len() as u64, i as u64);
-            total / n + u64::from(i < total % n)
-        };
+        let share = |total: u64, i: usize| even_share(total, tile.len(), i);
         for (i, mut record) in records.into_iter().enumerate() {
             record.residual = ResidualKind::Hash;
             record.hash_bytes = share(resident, i);
@@ -97,19 +109,56 @@ impl<W: Write + Seek> PackWriter<W> {
         Ok(())
     }
 
-    /// Writes records, table of contents and header; gives the bytes of the file.
-    pub fn finish(mut self, sequence: &SequenceRecord, settings: &SettingsRecord) -> Result<u64> {
+    /// The bases of a run of transfer: `frames` frames of the pack (counted from 0) from its first to its last, those
+    /// without transfer between them included. `codec` is `Raw` or `Deflate`.
+    pub fn push_transfer_bases(
+        &mut self,
+        first_frame: usize,
+        frames: usize,
+        bases: &TransferBases,
+        codec: Codec,
+    ) -> Result<()> {
+        let encoded = EncodedSection::of_bases(&self.path, "transfer.bases", bases, codec)?;
+        self.push_transfer(KIND_TRANSFER_BASES, first_frame, frames, &encoded)
+    }
+
+    /// The rows of transfer of a frame of the pack (counted from 0). `codec` is `Raw` or `Deflate`.
+    pub fn push_transfer_rows(&mut self, frame: usize, rows: &TransferRows, codec: Codec) -> Result<()> {
+        let encoded = EncodedSection::of_rows(&self.path, "transfer.rows", rows, codec)?;
+        self.push_transfer(KIND_TRANSFER_ROWS, frame, 1, &encoded)
+    }
+
+    /// The transfer of a frame, encoded before; bases that it brings are those of `frames` frames from it on, as in
+    /// [`Self::push_transfer_bases`].
+    pub fn push_encoded_transfer(&mut self, frames: usize, transfer: &EncodedTransfer) -> Result<()> {
+        let frame = transfer.record().frame as usize;
+        if let Some(bases) = &transfer.bases {
+            self.push_transfer(KIND_TRANSFER_BASES, frame, frames, bases)?;
+        }
+        self.push_transfer(KIND_TRANSFER_ROWS, frame, 1, &transfer.rows)
+    }
+
+    /// Writes records, table of contents and header; gives the bytes of the file. `transfer` names all transfer that was
+    /// pushed, and is none if none was.
+    pub fn finish(
+        mut self,
+        sequence: &SequenceRecord,
+        settings: &SettingsRecord,
+        transfer: Option<&TransferRecord>,
+    ) -> Result<u64> {
         sequence.check(&self.path)?;
         settings.check(&self.path)?;
         for (number, frame) in self.frames.iter().enumerate() {
             frame.check(&self.path, number, sequence)?;
         }
+        let transfer = self.finish_transfer(transfer)?;
         let path = self.path.clone();
-        for (kind, bytes) in [
+        let records = [
             (KIND_SEQUENCE, encode(&path, "sequence", sequence)?),
             (KIND_SETTINGS, encode(&path, "settings", settings)?),
             (KIND_FRAMES, encode(&path, "frames", &self.frames)?),
-        ] {
+        ];
+        for (kind, bytes) in records.into_iter().chain(transfer) {
             let resident = bytes.len() as u64;
             self.section(kind, Codec::Raw, 0..0, &bytes, resident)?;
         }
@@ -127,6 +176,37 @@ impl<W: Write + Seek> PackWriter<W> {
         self.out.write_all(&header.encode()).map_err(io)?;
         self.out.flush().map_err(io)?;
         Ok(header.file_bytes)
+    }
+
+    fn push_transfer(&mut self, kind: u32, frame: usize, frames: usize, encoded: &EncodedSection) -> Result<()> {
+        let end = frame.checked_add(frames).and_then(|end| u32::try_from(end).ok());
+        let Some(end) = end.filter(|_| frames > 0) else {
+            let found = format!("{frames} frames from {frame}");
+            return Err(Error::invalid(&self.path, "transfer.frames", found, "1 or more frames of the pack"));
+        };
+        self.transfer.insert(self.toc.len(), encoded.shape.clone());
+        self.section(kind, encoded.codec, frame as u32..end, &encoded.bytes, encoded.bytes_resident)
+    }
+
+    /// The section of the record of transfer, its bytes filled in; fails unless it fits what was pushed.
+    fn finish_transfer(&self, record: Option<&TransferRecord>) -> Result<Option<(u32, Vec<u8>)>> {
+        let Some(record) = record else {
+            sections_of_transfer(&self.path, &self.toc, &[])?;
+            return Ok(None);
+        };
+        record.check(&self.path, &self.frames)?;
+        let sections = sections_of_transfer(&self.path, &self.toc, &record.frames)?;
+        let mut record = record.clone();
+        let bytes = bytes_of_transfer(&self.toc, &sections);
+        for (i, section) in sections.iter().enumerate() {
+            let what = format!("transfer.frames[{i}].rows");
+            let (rows, bases) = (&self.transfer[&section.rows], &self.transfer[&section.bases]);
+            record.check_sets(&self.path, &what, rows)?;
+            record.frames[i].check_rows(&self.path, &what, rows)?;
+            rows.check_rows_by(&self.path, &what, bases)?;
+            (record.frames[i].bytes_at_rest, record.frames[i].bytes_resident) = bytes[i];
+        }
+        Ok(Some((KIND_TRANSFER, encode(&self.path, "transfer", &record)?)))
     }
 
     fn push_gaussians(&mut self, number: u32, frame: &EncodedFrame) -> Result<()> {
