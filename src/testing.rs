@@ -71,7 +71,8 @@ fn write_small_pack(path: &Path, frames: &[i32], step: f32, transfer: Option<&Tr
             writer.push_rank(&FrameData { record, gaussians: &gaussians, codes: &codes }, AtRest::RAW)?;
         }
         for (i, frame) in transfer.iter().flat_map(|record| &record.frames).enumerate() {
-            let bases = || vec![Bases { length: 1, clusters: 1, terms: 0, values: vec![Default::default()] }];
+            let bases =
+                || vec![Bases { length: 1, clusters: 1, terms: 0, scale: 1.0, values: vec![Default::default()] }];
             let rows = |count: u64| vec![Rows { ids: vec![0; count as usize], weights: vec![] }];
             if i == 0 {
                 writer.push_transfer_bases(0, 3, &TransferBases { direct: bases(), indirect: bases() }, Codec::Raw)?;

@@ -5,7 +5,7 @@
 //! the rows of a cluster `c` lie near an affine space of few dimensions,
 //!
 //! ```text
-//! row = mean_c + sum over t of weight_t * direction_(c,t)
+//! row = scale * (mean_c + sum over t of weight_t * direction_(c,t))
 //! ```
 //!
 //! so a row at rest is the number of its cluster and its weights; means and directions, the *bases*, are shared by
@@ -27,7 +27,7 @@ pub const MAX_TERMS: u32 = 255;
 pub const MAX_SETS: usize = 3;
 
 /// The bases of one set: each cluster has a mean and `terms` directions, each of `length` numbers.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Bases {
     /// Numbers of a row; 1 or more where there are clusters.
     pub length: u32,
@@ -35,6 +35,8 @@ pub struct Bases {
     pub clusters: u32,
     /// Directions of a cluster, 0 to 255.
     pub terms: u32,
+    /// What every row is times: thin smoke sends out little, and half floats end at 6e-8. Above 0 and finite.
+    pub scale: f32,
     /// `[cluster][1 + terms][length]`, the mean first; finite.
     pub values: Vec<f16>,
 }
@@ -84,6 +86,13 @@ pub(crate) struct Shape {
     pub(crate) indirect: Vec<SetShape>,
 }
 
+impl Default for Bases {
+    /// Of no rows.
+    fn default() -> Self {
+        Self { length: 0, clusters: 0, terms: 0, scale: 1.0, values: Vec::new() }
+    }
+}
+
 impl Bases {
     fn check(&self, path: &Path, what: &str) -> Result<SetShape> {
         let Self { length, clusters, terms, .. } = *self;
@@ -91,6 +100,10 @@ impl Bases {
         at_most(path, what, "terms", terms.into(), MAX_TERMS.into())?;
         if clusters > 0 && length == 0 {
             return Err(Error::invalid(path, format!("{what}.length"), 0, "1 or more"));
+        }
+        let good = self.scale > 0.0 && self.scale.is_finite();
+        if !good {
+            return Err(Error::invalid(path, format!("{what}.scale"), self.scale, "above 0 and finite"));
         }
         let expected = self.numbers();
         if self.values.len() as u128 != expected {
@@ -215,7 +228,7 @@ pub(crate) mod tests {
     }
 
     pub(crate) fn some_bases(length: u32, clusters: u32, terms: u32, seed: u64) -> Bases {
-        let empty = Bases { length, clusters, terms, values: vec![] };
+        let empty = Bases { length, clusters, terms, scale: 0.25, values: vec![] };
         Bases { values: some_values(empty.numbers() as usize, seed), ..empty }
     }
 

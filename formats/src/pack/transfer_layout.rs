@@ -15,8 +15,8 @@ use std::path::Path;
 
 /// Bytes before the sets: their numbers, direct and indirect.
 pub const HEADER_BYTES: usize = 8;
-/// Bytes before the values of a set of bases: length, clusters, terms.
-pub const BASES_BYTES: usize = 12;
+/// Bytes before the values of a set of bases: length, clusters, terms, scale.
+pub const BASES_BYTES: usize = 16;
 /// Bytes before the weights of a set of rows: rows, terms.
 pub const ROWS_BYTES: usize = 8;
 /// Sets start on multiples of this.
@@ -27,6 +27,7 @@ pub fn encode_bases(bases: &TransferBases) -> Vec<u8> {
     let mut bytes = header(bases.direct.len(), bases.indirect.len());
     for set in bases.direct.iter().chain(&bases.indirect) {
         [set.length, set.clusters, set.terms].iter().for_each(|v| bytes.extend(v.to_le_bytes()));
+        bytes.extend(set.scale.to_le_bytes());
         set.values.iter().for_each(|v| bytes.extend(v.to_le_bytes()));
         fill(&mut bytes);
     }
@@ -51,7 +52,8 @@ pub fn decode_bases(path: &Path, what: &str, bytes: &[u8]) -> Result<TransferBas
     let (direct, indirect) = sets(path, what, bytes, |head, what| {
         let mut field = |name: &str| head.u32(&format!("{what}.{name}"));
         let (length, clusters, terms) = (field("length")?, field("clusters")?, field("terms")?);
-        let mut set = Bases { length, clusters, terms, values: vec![] };
+        let scale = head.f32(&format!("{what}.scale"))?;
+        let mut set = Bases { length, clusters, terms, scale, values: vec![] };
         set.values = halves(head, &format!("{what}.values"), set.numbers())?;
         Ok(set)
     })?;
@@ -159,14 +161,15 @@ pub(super) mod tests {
     #[test]
     fn small_bases_and_rows_have_golden_bytes() {
         let half = |v: f32| f16::from_f32(v);
-        let set = Bases { length: 1, clusters: 1, terms: 0, values: vec![half(1.0)] };
-        let more = Bases { length: 1, clusters: 2, terms: 1, values: [1.0, -2.0, 0.5, 0.0].map(half).to_vec() };
+        let set = Bases { length: 1, clusters: 1, terms: 0, scale: 2.0, values: vec![half(1.0)] };
+        let more =
+            Bases { length: 1, clusters: 2, terms: 1, scale: 0.5, values: [1.0, -2.0, 0.5, 0.0].map(half).to_vec() };
         let bases = TransferBases { direct: vec![set], indirect: vec![more] };
-        // 1 is 3c00, -2 is c000, 0.5 is 3800.
+        // 1 is 3c00, -2 is c000, 0.5 is 3800; of the scales, 2 is 40000000 and 0.5 is 3f000000.
         let expected = [
             &[1, 0, 0, 0, 1, 0, 0, 0][..],
-            &[1, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0x00, 0x3c, 0, 0],
-            &[1, 0, 0, 0, 2, 0, 0, 0, 1, 0, 0, 0, 0x00, 0x3c, 0x00, 0xc0, 0x00, 0x38, 0, 0],
+            &[1, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0x40, 0x00, 0x3c, 0, 0],
+            &[1, 0, 0, 0, 2, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0x3f, 0x00, 0x3c, 0x00, 0xc0, 0x00, 0x38, 0, 0],
         ];
         assert_eq!(encode_bases(&bases), expected.concat());
         assert_eq!(decode_bases(path(), "b", &expected.concat()).unwrap(), bases);

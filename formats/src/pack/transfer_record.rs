@@ -29,7 +29,7 @@ pub struct TransferRecord {
     pub bands: u32,
     /// Cells of the indirect rows have `2^cell_shift` voxels a side; 0 to 4.
     pub cell_shift: u32,
-    /// Photons that were traced for each boundary face of the cells and each basis light.
+    /// Photons that were traced for each face of a voxel on the border and each light of the indirect basis.
     pub photons: u32,
     /// Seed of the photons.
     pub seed: u64,

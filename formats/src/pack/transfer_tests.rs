@@ -219,6 +219,7 @@ fn transfer_lies_where_the_page_says() {
         ("length", u32s(&[set.length])),
         ("clusters", u32s(&[set.clusters])),
         ("terms", u32s(&[set.terms])),
+        ("scale", f32s(&[set.scale])),
         ("values", halves(&set.values)),
     ];
     let end = assert_table("Set of bases", &bytes[HEADER_BYTES..], &fields);
@@ -320,7 +321,7 @@ fn every_defect_of_transfer_is_named() {
     // The list of frames is after a basis of six letters and a count; ids after five rows of two weights.
     let list = byte(said, 72 + 8 + 6 + 8);
     let infinite = half::f16::INFINITY.to_le_bytes();
-    let defects: [(&str, usize, Vec<u8>); 18] = [
+    let defects: [(&str, usize, Vec<u8>); 19] = [
         ("transfer.g", byte(said, 24), f32s(&[1.0])),
         ("transfer.basis", byte(said, 80), b"D".to_vec()),
         ("transfer.frames[1].frame", list + 72, u32s(&[2])),
@@ -330,7 +331,8 @@ fn every_defect_of_transfer_is_named() {
         ("transfer.frames[0].bases", list + 72 + 4, u32s(&[1])),
         ("transfer.frames[0].bases.indirect", byte(said, 60), u32s(&[0, 0, 0])),
         ("transfer.frames[1].rows.direct[0].rows", list + 72 + 8, u64s(&[6])),
-        ("transfer.frames[0].bases.direct[0].values[1]", byte(bases, 8 + 12 + 2), infinite.to_vec()),
+        ("transfer.frames[0].bases.direct[0].values[1]", byte(bases, 8 + 16 + 2), infinite.to_vec()),
+        ("transfer.frames[0].bases.direct[0].scale", byte(bases, 8 + 12), f32s(&[f32::NAN])),
         ("transfer.frames[1].rows.direct[0].weights[1]", byte(rows, 8 + 8 + 2), infinite.to_vec()),
         ("transfer.frames[1].rows.direct[0].ids", byte(rows, 8 + 8 + 20), vec![3]),
         ("transfer.frames[1].rows.direct[0]", byte(rows, 8 + 8 + 25), vec![1]),
