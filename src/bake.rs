@@ -2,14 +2,16 @@
 
 use crate::cli::{AtRest, BakeArgs, GaussianCount, ResidualAddress, TeleportRule};
 use crate::progress::Progress;
-use crate::seconds::{self, Seconds};
+use crate::seconds::{self, Seconds, Times};
+use crate::staging::{SceneChanges, Stage};
 use crate::{answer, failure::Failure, inspect};
 use serde_json::json;
 use smoke_baking::fit::frame::FitSettings;
 use smoke_baking::fit::teleport::Rule;
-use smoke_baking::pipeline::{self, BakeSettings, Event, default_promise};
+use smoke_baking::pipeline::{self, BakeSettings, Event, OnTransfer, TransferBake, default_promise};
 use smoke_baking::residual::tile::ResidualMode;
 use smoke_baking::survey::{Survey, survey};
+use smoke_baking::transfer::{Stage as TransferStage, TransferSettings};
 use smoke_formats::pack::{self, Pack, Promise};
 use smoke_formats::sequence::{Sequence, SequenceFrame};
 use std::collections::BTreeMap;
@@ -29,7 +31,7 @@ fn bake(args: &BakeArgs) -> Result<(), Failure> {
     let pack = write(args, &survey, &settings)?;
     let times = seconds::read(&pack);
     if args.json {
-        answer::json(&inspect::as_json(&pack, times.as_deref())?)
+        answer::json(&inspect::as_json(&pack, times.as_ref())?)
     } else {
         answer::text(&inspect::summary(&pack))
     }
@@ -45,7 +47,7 @@ pub fn pack(args: &BakeArgs) -> Result<Pack, Failure> {
 fn prepare(args: &BakeArgs) -> Result<(Survey, BakeSettings), Failure> {
     let (name, frames) = frames(args)?;
     pipeline::check_output(&args.output, &frames)?;
-    let settings = settings(args, name);
+    let settings = BakeSettings { transfer: transfer(args, &frames)?, ..settings(args, name) };
     settings.fit.bounds().map_err(|e| Failure::work(e.to_string()))?;
     let progress = Progress::start(args.progress, "reading frames", frames.len() as u64);
     let survey = survey(&frames, &args.grid, args.clamp, &|| progress.advance(1))?;
@@ -57,8 +59,9 @@ fn prepare(args: &BakeArgs) -> Result<(Survey, BakeSettings), Failure> {
 /// The pack, and the seconds beside it.
 fn write(args: &BakeArgs, survey: &Survey, settings: &BakeSettings) -> Result<Pack, Failure> {
     let json = settings_json(args, settings, survey);
-    let times =
-        watch(args, survey, |observe| pipeline::bake(survey, settings, &json, &args.output, args.resume, observe))?;
+    let times = watch(args, survey, settings, |observe, on_transfer| {
+        pipeline::bake(survey, settings, &json, &args.output, args.resume, observe, on_transfer)
+    })?;
     seconds::write(&args.output, &times)?;
     Ok(Pack::open(&args.output)?)
 }
@@ -125,7 +128,33 @@ fn settings(args: &BakeArgs, name: String) -> BakeSettings {
         key_every: args.key_every as usize,
         frames_per_second: args.fps,
         seed: args.seed,
+        transfer: None,
     }
+}
+
+/// The transfer that is asked for: of the scene's medium, for frames that are baked.
+fn transfer(args: &BakeArgs, frames: &[SequenceFrame]) -> Result<Option<TransferBake>, Failure> {
+    let (Some(basis), Some(scene)) = (args.transfer, &args.medium) else { return Ok(None) };
+    let stage = Stage::read(scene, &SceneChanges::default())?;
+    let baked: Vec<i32> = frames.iter().map(|frame| frame.number).collect();
+    let chosen = match &args.transfer_frames {
+        None => baked,
+        Some(selection) => {
+            let positions = selection.positions(&args.input, &baked)?;
+            positions.into_iter().map(|position| baked[position]).collect()
+        }
+    };
+    let settings = TransferSettings {
+        basis,
+        medium: stage.medium,
+        clusters: args.clusters as usize,
+        terms: args.terms as usize,
+        photons: args.photons,
+        shift: args.transfer_cell,
+        seed: args.seed,
+        memory: args.memory,
+    };
+    Ok(Some(TransferBake { settings, frames: chosen, run: args.transfer_run as usize }))
 }
 
 /// What the pack keeps of the settings that made it: everything that decides its bytes.
@@ -134,7 +163,7 @@ fn settings_json(args: &BakeArgs, settings: &BakeSettings, survey: &Survey) -> S
         Promise::MaxError(error) => json!({ "max_error": error }),
         Promise::Psnr(db) => json!({ "psnr_db": db }),
     };
-    json!({
+    let mut document = json!({
         "program": concat!("smoke-bake ", env!("CARGO_PKG_VERSION")),
         "grid": args.grid,
         "clamp": args.clamp,
@@ -145,8 +174,24 @@ fn settings_json(args: &BakeArgs, settings: &BakeSettings, survey: &Survey) -> S
         "key_every": settings.key_every,
         "frames_per_second": settings.frames_per_second,
         "seed": settings.seed,
-    })
-    .to_string()
+    });
+    if let Some(transfer) = &settings.transfer {
+        let TransferSettings { basis, medium, clusters, terms, photons, shift, memory, .. } = transfer.settings;
+        document["transfer"] = json!({
+            "basis": basis.name(),
+            "sigma_t": medium.sigma_t,
+            "albedo": medium.albedo,
+            "g": medium.g,
+            "clusters": clusters,
+            "terms": terms,
+            "photons": photons,
+            "cell": 1u32 << shift,
+            "memory": memory,
+            "run": transfer.run,
+            "frames": transfer.frames,
+        });
+    }
+    document.to_string()
 }
 
 /// `--dry-run`: what would be baked.
@@ -187,11 +232,23 @@ fn plan(args: &BakeArgs, survey: &Survey, settings: &BakeSettings) -> Result<(),
 fn watch(
     args: &BakeArgs,
     survey: &Survey,
-    bake: impl FnOnce(&mut dyn FnMut(Event)) -> smoke_baking::Result<()>,
-) -> Result<Vec<(i32, Seconds)>, Failure> {
-    let progress = Progress::start(args.progress, "baking frames", survey.frames.len() as u64);
+    settings: &BakeSettings,
+    bake: impl FnOnce(&mut dyn FnMut(Event), OnTransfer) -> smoke_baking::Result<()>,
+) -> Result<Times, Failure> {
+    let runs = settings.transfer.as_ref().map_or(0, |t| t.frames.len().div_ceil(t.run.max(1)));
+    let steps = survey.frames.len() + runs;
+    let progress = Progress::start(args.progress, "baking frames", steps as u64);
+    let on_transfer = |frame: i32, stage: TransferStage, part: f64| {
+        let stage = match stage {
+            TransferStage::Direct => "direct light",
+            TransferStage::Photons => "photons",
+            TransferStage::Compress => "compressing",
+        };
+        progress.describe(format!("frame {frame}, transfer, {stage} {:.0} %", 100.0 * part));
+    };
+    let mut transfer = Vec::new();
     let mut times: BTreeMap<i32, Seconds> = survey.frames.iter().map(|f| (f.number, Seconds::default())).collect();
-    bake(&mut |event| match event {
+    let observe = &mut |event| match event {
         Event::Fit { frame, progress: fit } => {
             let (done, most, error) = (fit.evaluations, fit.most, fit.error);
             progress.describe(format!("frame {frame}, evaluation {done}/{most}, error {error:.4}"));
@@ -207,7 +264,12 @@ fn watch(
             let share = seconds / frames.len() as f64;
             frames.iter().for_each(|frame| times.entry(*frame).or_default().hash += share);
         }
-    })?;
+        Event::TransferDone { frames, seconds } => {
+            transfer.push((frames[0], seconds.unwrap_or_default()));
+            progress.advance(1);
+        }
+    };
+    bake(observe, &on_transfer)?;
     progress.finish();
-    Ok(times.into_iter().collect())
+    Ok(Times { frames: times.into_iter().collect(), transfer })
 }

@@ -3,6 +3,7 @@
 use crate::cli::{ExponentialChoice, MultipleChoice, RenderArgs, RouteChoice, ScatteringOrders};
 use crate::failure::Failure;
 use crate::method::does_not_apply;
+use crate::transfer;
 use serde_json::{Value, json};
 use smoke_runtime::march::MarchSettings;
 use smoke_runtime::renderer::{RenderSettings, Route};
@@ -15,6 +16,7 @@ use smoke_runtime::transport::compensated::grid::route::GridSettings;
 pub fn settings(args: &RenderArgs, base: &RenderSettings) -> Result<RenderSettings, Failure> {
     let refuse = does_not_apply;
     let with = "--method compensated";
+    refuse(args.suns.is_some(), "--suns", with)?;
     refuse(args.target_error.is_some(), "--target-error", with)?;
     refuse(args.max_passes.is_some(), "--max-passes", with)?;
     refuse(args.seed.is_some(), "--seed", with)?;
@@ -39,7 +41,8 @@ pub fn settings(args: &RenderArgs, base: &RenderSettings) -> Result<RenderSettin
         None => base.scattering,
     };
     let route = match (args.route, base.route) {
-        (Some(RouteChoice::Grid), _) | (None, Route::Grid(_)) => {
+        // A base of this method never has transfer; the grid is what it falls back to.
+        (Some(RouteChoice::Grid), _) | (None, Route::Grid(_) | Route::Transfer(_)) => {
             let with = "--route grid";
             refuse(args.exponential.is_some(), "--exponential", with)?;
             refuse(args.multiple.is_some_and(|m| m != MultipleChoice::Transport), "this --multiple", with)?;
@@ -78,28 +81,45 @@ pub fn settings(args: &RenderArgs, base: &RenderSettings) -> Result<RenderSettin
             Route::Centres(CentreSettings { order: sh_order, exponential, multiple, ..d })
         }
     };
-    let march = MarchSettings {
-        step: args.march_step.map_or(base.march.step, |v| v as f32),
-        cutoff: args.cutoff.map_or(base.march.cutoff, |v| v as f32),
-        samples: args.samples.map_or(base.march.samples, usize::from),
-        half_resolution: args.half_resolution || base.march.half_resolution,
-    };
-    Ok(RenderSettings { route, sh_order, scattering, march })
+    Ok(RenderSettings { route, sh_order, scattering, march: march(args, &base.march) })
+}
+
+/// The dials of the march: those given, and those of `base` for the rest.
+pub fn march(args: &RenderArgs, base: &MarchSettings) -> MarchSettings {
+    MarchSettings {
+        step: args.march_step.map_or(base.step, |v| v as f32),
+        cutoff: args.cutoff.map_or(base.cutoff, |v| v as f32),
+        samples: args.samples.map_or(base.samples, usize::from),
+        half_resolution: args.half_resolution || base.half_resolution,
+    }
+}
+
+/// The march as an image's metadata has it.
+pub fn march_document(march: &MarchSettings) -> Value {
+    json!({
+        "march_step": if march.step == 0.0 { json!("automatic") } else { json!(march.step) },
+        "cutoff": march.cutoff,
+        "samples": march.samples,
+        "half_resolution": march.half_resolution,
+    })
 }
 
 /// The settings as an image's metadata has them.
 pub fn document(settings: &RenderSettings) -> Value {
     let automatic = |step: usize| if step == 0 { json!("automatic") } else { json!(step) };
+    if let Route::Transfer(dials) = settings.route {
+        return transfer::document(settings, dials);
+    }
     let mut render = json!({
         "method": "compensated",
         "order": if settings.scattering == ScatteringOrder::Single { "single" } else { "all" },
         "sh_order": settings.sh_order,
-        "march_step": if settings.march.step == 0.0 { json!("automatic") } else { json!(settings.march.step) },
-        "cutoff": settings.march.cutoff,
-        "samples": settings.march.samples,
-        "half_resolution": settings.march.half_resolution,
     });
+    if let (Some(render), Value::Object(march)) = (render.as_object_mut(), march_document(&settings.march)) {
+        render.extend(march);
+    }
     match settings.route {
+        Route::Transfer(_) => {}
         Route::Grid(grid) => {
             render["route"] = json!("grid");
             render["multiple"] = json!("transport");

@@ -4,7 +4,7 @@
 //! are those that the bake measured; `validate` reads every byte.
 
 use crate::cli::InspectArgs;
-use crate::seconds::{self, Seconds};
+use crate::seconds::{self, Seconds, Times, TransferSeconds};
 use crate::{answer, failure::Failure};
 use serde_json::{Value, json};
 use smoke_formats::Error;
@@ -15,8 +15,11 @@ use std::fmt::Write;
 /// Opens the pack and prints what it says.
 pub fn run(args: &InspectArgs) -> Result<(), Failure> {
     let pack = Pack::open(&args.pack)?;
-    let seconds = seconds::read(&pack);
-    if args.json { answer::json(&as_json(&pack, seconds.as_deref())?) } else { answer::text(&as_text(&pack, seconds)) }
+    let times = seconds::read(&pack);
+    match args.json {
+        true => answer::json(&as_json(&pack, times.as_ref())?),
+        false => answer::text(&as_text(&pack, times.map(|t| of_frames(&t)))),
+    }
 }
 
 /// Sums, means and extremes over the frames.
@@ -79,6 +82,20 @@ impl TransferTotals {
     }
 }
 
+fn of_frames(times: &Times) -> Vec<Seconds> {
+    times.frames.iter().map(|(_, seconds)| *seconds).collect()
+}
+
+/// Sums over the runs, and the largest memory.
+fn total_transfer_seconds(times: &Times) -> TransferSeconds {
+    times.transfer.iter().fold(TransferSeconds::default(), |sum, (_, s)| TransferSeconds {
+        direct: sum.direct + s.direct,
+        photons: sum.photons + s.photons,
+        compress: sum.compress + s.compress,
+        peak_bytes: sum.peak_bytes.max(s.peak_bytes),
+    })
+}
+
 fn total_seconds(frames: &[Seconds]) -> Seconds {
     frames.iter().fold(Seconds::default(), |sum, s| Seconds {
         read: sum.read + s.read,
@@ -97,7 +114,9 @@ fn residual_name(kind: ResidualKind) -> &'static str {
 }
 
 /// The document of `--json`; `bake --json` prints the same of the pack it wrote.
-pub fn as_json(pack: &Pack, seconds: Option<&[Seconds]>) -> Result<Value, Failure> {
+pub fn as_json(pack: &Pack, times: Option<&Times>) -> Result<Value, Failure> {
+    let seconds = times.map(of_frames);
+    let seconds = seconds.as_deref();
     let (sequence, totals) = (pack.sequence(), Totals::of(pack.frames()));
     // The reader has seen that it is JSON; numbers beyond f64 could still fail here.
     let settings: Value = serde_json::from_str(&pack.settings().json)
@@ -156,12 +175,13 @@ pub fn as_json(pack: &Pack, seconds: Option<&[Seconds]>) -> Result<Value, Failur
             "file_bytes": pack.file_bytes(),
             "seconds": seconds.map(total_seconds),
         },
-        "transfer": pack.transfer().map(|record| transfer_json(pack, record)),
+        "transfer": pack.transfer().map(|record| transfer_json(pack, record, times)),
     }))
 }
 
 /// The part on precomputed transfer; frames are told by the source's numbers.
-fn transfer_json(pack: &Pack, record: &TransferRecord) -> Value {
+fn transfer_json(pack: &Pack, record: &TransferRecord, times: Option<&Times>) -> Value {
+    let times = times.filter(|t| !t.transfer.is_empty()).map(total_transfer_seconds);
     let totals = TransferTotals::of(record);
     let number = |frame: u32| pack.frames()[frame as usize].frame;
     let frames = record.frames.iter().map(|f| {
@@ -189,6 +209,8 @@ fn transfer_json(pack: &Pack, record: &TransferRecord) -> Value {
         "raw_bytes": totals.raw_bytes,
         "compression_error": { "direct": totals.direct_error, "indirect": totals.indirect_error },
         "truncated": totals.truncated,
+        "seconds": times.map(|t| json!({ "direct": t.direct, "photons": t.photons, "compress": t.compress })),
+        "peak_bytes": times.map(|t| t.peak_bytes),
         "per_frame": frames.collect::<Vec<_>>(),
     })
 }
@@ -319,7 +341,8 @@ mod tests {
     fn totals_are_the_sums_and_extremes_of_the_frames() {
         let (_folder, pack) = packed(&[3, 5]);
         let stage = Seconds { read: 1.0, fit: 2.0, residual: 3.0, hash: 4.0, write: 5.0 };
-        let json = as_json(&pack, Some(&[stage, stage])).unwrap();
+        let times = Times { frames: vec![(1, stage), (2, stage)], transfer: vec![] };
+        let json = as_json(&pack, Some(&times)).unwrap();
         let at = |pointer: &str| json.pointer(pointer).and_then(Value::as_f64).unwrap();
         assert_eq!((at("/totals/active_voxels"), at("/totals/rbfs"), at("/totals/seconds/write")), (24.0, 6.0, 10.0));
         let sum = at("/frames/0/bytes_at_rest") + at("/frames/1/bytes_at_rest");
@@ -380,6 +403,8 @@ mod tests {
             "raw_bytes",
             "compression_error",
             "truncated",
+            "seconds",
+            "peak_bytes",
             "per_frame",
         ];
         assert_eq!(keys, expected);

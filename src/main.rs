@@ -20,6 +20,7 @@ mod staging;
 mod sweep;
 #[cfg(test)]
 mod testing;
+mod transfer;
 mod unpack;
 mod validate;
 

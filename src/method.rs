@@ -3,7 +3,7 @@
 use crate::cli::{MethodChoice, RenderArgs};
 use crate::failure::Failure;
 use crate::staging::Stage;
-use crate::{compensated, plan, reference};
+use crate::{compensated, plan, reference, transfer};
 use clap::error::ErrorKind;
 use serde_json::{Value, json};
 use smoke_formats::pack::Pack;
@@ -20,6 +20,8 @@ use std::time::Instant;
 pub enum Method {
     /// Source radiance and a march.
     Compensated(RenderSettings),
+    /// The same march, with source radiance from baked transfer.
+    Transfer(RenderSettings),
     /// Path tracing.
     Reference(ReferenceSettings),
 }
@@ -27,7 +29,7 @@ pub enum Method {
 /// A method ready for frames of one scene.
 pub enum Maker<'a> {
     /// Keeps what frames have in common.
-    Compensated(Box<Renderer>, &'a Stage),
+    Marched(Box<Renderer>, &'a Stage),
     /// Keeps nothing.
     Reference(ReferenceSettings, &'a Stage),
 }
@@ -62,6 +64,7 @@ impl Method {
         let point = stage.lights.iter().any(|light| matches!(light, Light::Point { .. }));
         match args.method {
             MethodChoice::Reference => Self::traced(args, ReferenceSettings::default()),
+            MethodChoice::Transfer => transfer::settings(args).map(Self::Transfer),
             MethodChoice::Auto if point => Self::traced(args, ReferenceSettings::default()),
             MethodChoice::Auto | MethodChoice::Compensated => Self::marched(args, RenderSettings::default()),
         }
@@ -98,7 +101,7 @@ impl Method {
     /// Name and settings, as an image's metadata has them.
     pub fn document(&self) -> Value {
         match self {
-            Self::Compensated(settings) => compensated::document(settings),
+            Self::Compensated(settings) | Self::Transfer(settings) => compensated::document(settings),
             Self::Reference(settings) => reference::document(settings),
         }
     }
@@ -106,9 +109,9 @@ impl Method {
     /// Ready for frames under the lights and medium of `stage`.
     pub fn maker<'a>(&self, stage: &'a Stage) -> Result<Maker<'a>, String> {
         Ok(match self {
-            Self::Compensated(settings) => {
+            Self::Compensated(settings) | Self::Transfer(settings) => {
                 let renderer = Renderer::new(*settings, stage.medium, stage.lights.clone());
-                Maker::Compensated(Box::new(renderer.map_err(|e| e.to_string())?), stage)
+                Maker::Marched(Box::new(renderer.map_err(|e| e.to_string())?), stage)
             }
             Self::Reference(settings) => Maker::Reference(*settings, stage),
         })
@@ -120,7 +123,7 @@ impl Maker<'_> {
     pub fn image(&mut self, frame: Frame, done: &mut dyn FnMut(f64)) -> Result<Image, String> {
         let start = Instant::now();
         match self {
-            Self::Compensated(renderer, stage) => {
+            Self::Marched(renderer, stage) => {
                 renderer.set_frame(frame).map_err(|e| e.to_string())?;
                 let prepared = start.elapsed().as_secs_f64();
                 let (film, seconds) = renderer.render(&stage.camera).map_err(|e| e.to_string())?;

@@ -23,6 +23,7 @@ pub fn settings(args: &RenderArgs, base: &ReferenceSettings) -> Result<Reference
         (args.cutoff.is_some(), "--cutoff"),
         (args.samples.is_some(), "--samples"),
         (args.half_resolution, "--half-resolution"),
+        (args.suns.is_some(), "--suns"),
     ];
     for (given, option) in numbers {
         does_not_apply(given, option, with)?;

@@ -33,6 +33,7 @@ struct Job<'a> {
     scene: &'a Scene,
     /// Dials and scene, for the metadata.
     document: Value,
+    method: Method,
     detail: Detail,
     precision: SamplePrecision,
 }
@@ -61,6 +62,7 @@ pub fn run(args: &RenderArgs) -> Result<(), Failure> {
         pack: &pack,
         scene,
         document: document(&method, args.detail, scene),
+        method,
         detail: args.detail,
         precision: if args.float { SamplePrecision::Float } else { SamplePrecision::Half },
     };
@@ -95,11 +97,12 @@ pub fn run(args: &RenderArgs) -> Result<(), Failure> {
     answer::text(&format!("{count} images of {} x {} in {total:.2} s, {each:.2} s each\n", scene.width, scene.height))
 }
 
-/// As much as `detail` asks of the frame at `position` of a pack.
-pub fn read(pack: &Pack, position: usize, detail: Detail) -> Result<Frame, Error> {
-    match detail {
-        Detail::Full => Frame::read(pack, position),
-        Detail::Gaussians => Frame::read_gaussians(pack, position),
+/// As much as `method` needs and `detail` asks of the frame at `position` of a pack.
+pub fn read(pack: &Pack, position: usize, method: &Method, detail: Detail) -> Result<Frame, Error> {
+    match (method, detail) {
+        (Method::Transfer(_), _) => Frame::read_with_transfer(pack, position),
+        (_, Detail::Full) => Frame::read(pack, position),
+        (_, Detail::Gaussians) => Frame::read_gaussians(pack, position),
     }
 }
 
@@ -114,7 +117,7 @@ impl Job<'_> {
     fn frame(&self, position: usize, maker: &mut Maker, path: PathBuf, progress: &Progress) -> Result<Report, Failure> {
         let number = self.pack.frames()[position].frame;
         let start = Instant::now();
-        let frame = read(self.pack, position, self.detail)?;
+        let frame = read(self.pack, position, &self.method, self.detail)?;
         let mut seconds = vec![("decode", start.elapsed().as_secs_f64())];
         let mut steps = 0;
         let mut advance = |part: f64| {

@@ -16,11 +16,11 @@ use smoke_runtime::light::{Environment, Light};
 use smoke_runtime::march::{MarchMedium, MarchSettings, march};
 use smoke_runtime::medium::field::DensityField;
 use smoke_runtime::sphere::light_basis::{BasisKind, LightBasis};
-use smoke_runtime::transport::SourceRadiance;
 use smoke_runtime::transport::medium::MediumParameters;
 use smoke_runtime::transport::reference::{Estimate, ReferenceSettings, trace};
 use smoke_runtime::transport::transfer::frame::{Clustered, FrameTransfer};
 use smoke_runtime::transport::transfer::source::{TransferSettings as Dials, TransferTransport};
+use smoke_runtime::transport::{ScatteringOrder, SourceRadiance};
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
@@ -196,7 +196,7 @@ fn bytes(run: &RunTransfer) -> usize {
 fn error(field: &DensityField, camera: &Camera, case: &Case, transfer: &Arc<FrameTransfer>, dials: Dials) -> f64 {
     let mut transport = TransferTransport::new(field, transfer.clone(), dials).expect("a transfer of this field");
     let start = Instant::now();
-    let source = transport.light(field, &case.lights);
+    let source = transport.light(field, &case.lights, ScatteringOrder::All);
     let lit = start.elapsed().as_secs_f64();
     let start = Instant::now();
     let shaded = source.shade(field, camera.position);

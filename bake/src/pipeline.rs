@@ -8,18 +8,24 @@ use crate::fit::frame::{Fit, FitProgress, FitSettings, fit_first, fit_next, refe
 use crate::residual::quantise::{Target, quantise};
 use crate::residual::tile::{ResidualMode, choose};
 use crate::survey::{Survey, SurveyedFrame, hash_file, read_density};
+use crate::transfer::at_rest::to_pack;
+use crate::transfer::{Stage, TransferSeconds, TransferSettings, bake_run};
 use crate::work::Work;
 use crate::{Error, Result};
 use rayon::prelude::*;
 use smoke_formats::gaussian::{Gaussian, UnitSpace};
 use smoke_formats::pack::{
-    self, AtRest, EncodedFrame, FrameData, FrameRecord, Promise, SequenceRecord, SettingsRecord,
+    self, AtRest, Codec, EncodedFrame, EncodedTransfer, FrameData, FrameRecord, Promise, SequenceRecord,
+    SettingsRecord, TransferFrameRecord, TransferRecord,
 };
 use smoke_formats::residual::ResidualCodes;
 use smoke_formats::residual::hash::{HashTable, MAX_FRAMES};
 use smoke_formats::sequence::SequenceFrame;
 use smoke_formats::volume::DensityGrid;
+use smoke_runtime::medium::decoder::decode_field;
+use smoke_runtime::medium::field::DensityField;
 use smoke_runtime::medium::gaussian_sum::gaussian_sum;
+use smoke_runtime::sphere::light_basis::LightBasis;
 use std::path::Path;
 use std::time::Instant;
 
@@ -42,6 +48,39 @@ pub struct BakeSettings {
     pub frames_per_second: Option<f64>,
     /// Seed of the search for hashes.
     pub seed: u64,
+    /// Transfer, if it is wanted.
+    pub transfer: Option<TransferBake>,
+}
+
+/// What transfer is baked, and for which frames.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TransferBake {
+    /// The transfer of a frame.
+    pub settings: TransferSettings,
+    /// Source numbers of the frames that get one, ascending; each a frame of the sequence.
+    pub frames: Vec<i32>,
+    /// Frames in a row that share bases, at least 1.
+    pub run: usize,
+}
+
+impl TransferBake {
+    /// What the pack says of it.
+    fn record(&self, frames: Vec<TransferFrameRecord>) -> TransferRecord {
+        let TransferSettings { basis, medium, photons, shift, seed, .. } = self.settings;
+        TransferRecord {
+            sigma_t: medium.sigma_t,
+            albedo: medium.albedo,
+            g: medium.g,
+            bands: self.settings.bands() as u32,
+            cell_shift: shift,
+            photons,
+            seed,
+            direct_of_channel: self.settings.extinctions().1.map(|set| set as u32),
+            indirect_of_channel: self.settings.media().1.map(|set| set as u32),
+            basis: basis.name(),
+            frames,
+        }
+    }
 }
 
 /// 8 bits: no voxel is further off than 1/510 of the sequence's largest density.
@@ -83,6 +122,13 @@ pub enum Event {
         /// How long it took, in whichever bake; none if that was not kept.
         seconds: Option<Seconds>,
     },
+    /// The transfer of a run of frames is done.
+    TransferDone {
+        /// Frames of the run.
+        frames: Vec<i32>,
+        /// How long it took, in whichever bake; none if that was not kept.
+        seconds: Option<TransferSeconds>,
+    },
     /// A tile of frames is laid out: its share of seconds goes to each frame's `hash`.
     Tile {
         /// Frames of the tile.
@@ -113,6 +159,9 @@ pub fn check_output(output: &Path, frames: &[SequenceFrame]) -> Result<()> {
     }
 }
 
+/// Told where the transfer of a run is, from any thread: its first frame, the stage, and how far, from 0 to 1.
+pub type OnTransfer<'a> = &'a (dyn Fn(i32, Stage, f64) + Sync);
+
 /// Bakes a surveyed sequence to the file `output`.
 ///
 /// `settings_json` is the JSON document that the pack keeps of its settings. With `resume`, frames that an interrupted
@@ -124,6 +173,7 @@ pub fn bake(
     output: &Path,
     resume: bool,
     observe: &mut dyn FnMut(Event),
+    on_transfer: OnTransfer,
 ) -> Result<()> {
     let work = Work::open(output, &fingerprint(survey, settings_json), resume)?;
     let space = UnitSpace::of_box(survey.origin, survey.dims);
@@ -178,8 +228,53 @@ pub fn bake(
         name: settings.name.clone(),
         grid: survey.grid.clone(),
     };
+    if let Some(transfer) = &settings.transfer {
+        bake_transfer(survey, transfer, &space, &work, output, observe, on_transfer)?;
+    }
     assemble(survey, settings, settings_json, &sequence, &work, observe)?;
     work.finish(output)
+}
+
+/// The transfer of every run of frames, against the density as it lies in the pack.
+fn bake_transfer(
+    survey: &Survey,
+    transfer: &TransferBake,
+    space: &UnitSpace,
+    work: &Work,
+    output: &Path,
+    observe: &mut dyn FnMut(Event),
+    on_transfer: OnTransfer,
+) -> Result<()> {
+    let kind = transfer.settings.basis;
+    let bases = [LightBasis::new(kind), LightBasis::new(kind.coarser())];
+    for frames in transfer.frames.chunks(transfer.run.max(1)) {
+        if frames.iter().all(|&frame| work.load_transfer(frame).is_some()) {
+            let seconds = work.load_transfer_seconds(frames[0]);
+            observe(Event::TransferDone { frames: frames.to_vec(), seconds });
+            continue;
+        }
+        let mut fields = Vec::with_capacity(frames.len());
+        for &frame in frames {
+            let encoded = work.load(frame).ok_or_else(|| Error::Changed { path: output.to_owned() })?;
+            let (gaussians, codes) = (encoded.decode_gaussians(output)?, encoded.codes(output)?);
+            let step = encoded.record().step;
+            fields.push(decode_field(&gaussians, &codes, step, space, survey.world_from_index));
+        }
+        let fields: Vec<&DensityField> = fields.iter().collect();
+        let tell = |stage, done: u64, all: u64| on_transfer(frames[0], stage, done as f64 / all.max(1) as f64);
+        let run = bake_run(&fields, [&bases[0], &bases[1]], &transfer.settings, &tell);
+        let position = |frame: &i32| survey.frames.iter().position(|f| f.number == *frame).unwrap_or_default();
+        let numbers: Vec<usize> = frames.iter().map(position).collect();
+        let (bases, rows) = to_pack(&run, &numbers);
+        // Last frame first: the run is there once the frame that brings the bases is.
+        for ((record, rows), &frame) in rows.iter().zip(frames).rev() {
+            let bases = (frame == frames[0]).then_some(&bases);
+            work.store_transfer(frame, &EncodedTransfer::new(output, record, rows, bases, Codec::Raw)?)?;
+        }
+        work.store_transfer_seconds(frames[0], &run.seconds)?;
+        observe(Event::TransferDone { frames: frames.to_vec(), seconds: Some(run.seconds) });
+    }
+    Ok(())
 }
 
 /// What a later frame needs of the ones before it.
@@ -291,7 +386,30 @@ fn assemble(
             let seconds = start.elapsed().as_secs_f64();
             observe(Event::Tile { frames: tile.iter().map(|f| f.number).collect(), seconds });
         }
-        writer.finish(sequence, &SettingsRecord { json: settings_json.to_owned() }, None)
+        let transfer = match &settings.transfer {
+            None => None,
+            Some(transfer) => {
+                let mut records = vec![];
+                for frames in transfer.frames.chunks(transfer.run.max(1)) {
+                    let mut span = 0;
+                    let mut run = vec![];
+                    for &frame in frames {
+                        let Some(encoded) = work.load_transfer(frame) else {
+                            failed = Some(Error::Changed { path: path.clone() });
+                            return Err(smoke_formats::Error::invalid(&path, "work", "transfer lost", "all of it"));
+                        };
+                        span = 1 + (encoded.record().frame - encoded.record().first_of_run) as usize;
+                        run.push(encoded);
+                    }
+                    for encoded in &run {
+                        writer.push_encoded_transfer(span, encoded)?;
+                        records.push(*encoded.record());
+                    }
+                }
+                Some(transfer.record(records))
+            }
+        };
+        writer.finish(sequence, &SettingsRecord { json: settings_json.to_owned() }, transfer.as_ref())
     });
     match failed {
         Some(error) => Err(error),

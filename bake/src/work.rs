@@ -6,9 +6,10 @@
 //! The pack itself is put together in the folder and renamed over the output at the end.
 
 use crate::pipeline::Seconds;
+use crate::transfer::TransferSeconds;
 use crate::{Error, Result};
 use smoke_formats::atomic;
-use smoke_formats::pack::EncodedFrame;
+use smoke_formats::pack::{EncodedFrame, EncodedTransfer};
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
@@ -105,6 +106,36 @@ impl Work {
     pub fn store(&self, frame: &EncodedFrame) -> Result<()> {
         let path = self.frame_file(frame.record().frame);
         Ok(atomic::write_bytes(&path, &frame.to_bytes(&path)?)?)
+    }
+
+    fn transfer_file(&self, frame: i32) -> PathBuf {
+        self.folder.join(format!("transfer.{frame}"))
+    }
+
+    /// The transfer of a frame that was finished before; none if it was not, or if its file is damaged.
+    pub fn load_transfer(&self, frame: i32) -> Option<EncodedTransfer> {
+        let path = self.transfer_file(frame);
+        EncodedTransfer::from_bytes(&path, &std::fs::read(&path).ok()?).ok()
+    }
+
+    /// Keeps the transfer of a frame.
+    pub fn store_transfer(&self, frame: i32, transfer: &EncodedTransfer) -> Result<()> {
+        let path = self.transfer_file(frame);
+        Ok(atomic::write_bytes(&path, &transfer.to_bytes(&path)?)?)
+    }
+
+    /// Keeps how long a run took that starts with `frame`, for the bake that takes it over.
+    pub fn store_transfer_seconds(&self, frame: i32, seconds: &TransferSeconds) -> Result<()> {
+        let path = self.folder.join(format!("transfer_seconds.{frame}"));
+        let text = serde_json::to_string(seconds);
+        let text = text.map_err(|e| smoke_formats::Error::invalid(&path, "seconds", e, "finite numbers"))?;
+        Ok(atomic::write_bytes(&path, text.as_bytes())?)
+    }
+
+    /// How long that run took, if it was kept.
+    pub fn load_transfer_seconds(&self, frame: i32) -> Option<TransferSeconds> {
+        let path = self.folder.join(format!("transfer_seconds.{frame}"));
+        serde_json::from_slice(&std::fs::read(path).ok()?).ok()
     }
 
     /// Where the pack is put together.

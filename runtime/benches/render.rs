@@ -31,7 +31,7 @@ fn frame() -> Frame {
     let map = DAffine3::from_scale(DVec3::splat(1.0 / 32.0));
     let field = DensityField::from_box([0; 3], dims, &values, map);
     let unit = UnitSpace::of_box([0; 3], dims.map(|d| d as u32));
-    Frame { field, gaussians: vec![], unit, first_node: [-1; 3], world_from_index: map }
+    Frame { field, gaussians: vec![], unit, first_node: [-1; 3], world_from_index: map, transfer: None }
 }
 
 fn lights() -> Vec<Light> {

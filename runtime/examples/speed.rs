@@ -40,7 +40,7 @@ fn cloud(n: usize) -> Frame {
     let map = DAffine3::from_scale(glam::DVec3::splat(1.0 / 64.0));
     let values = gaussian_sum(&gaussians, &unit, [0; 3], [64; 3]);
     let field = DensityField::from_box([0; 3], [64; 3], &values, map);
-    Frame { field, gaussians, unit, first_node: [-1; 3], world_from_index: map }
+    Frame { field, gaussians, unit, first_node: [-1; 3], world_from_index: map, transfer: None }
 }
 
 /// Least seconds of [`RUNS`] runs, stage by stage: new frame, new lights, new camera.
@@ -102,7 +102,14 @@ fn main() -> Result<(), Failure> {
     let field = DensityField::from_box(grid.origin, grid.dims, &grid.values, grid.world_from_index);
     let unit = UnitSpace::of_box(grid.origin, grid.dims.map(|d| d as u32));
     let world_from_index = grid.world_from_index;
-    let plume = Frame { field, gaussians: vec![], unit, first_node: grid.origin.map(|o| o - 1), world_from_index };
+    let plume = Frame {
+        field,
+        gaussians: vec![],
+        unit,
+        first_node: grid.origin.map(|o| o - 1),
+        world_from_index,
+        transfer: None,
+    };
     let medium = |g| MediumParameters { sigma_t: [8.0; 3], albedo: [0.92; 3], g };
 
     println!("# Speed\n");

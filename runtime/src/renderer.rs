@@ -16,6 +16,7 @@ use crate::transport::compensated::centres::route::{CentreError, CentreSettings,
 use crate::transport::compensated::centres::source::{CentreSource, UnitPlacement};
 use crate::transport::compensated::grid::route::{GridSettings, GridTransport};
 use crate::transport::medium::{MediumError, MediumParameters};
+use crate::transport::transfer::source::{TransferError, TransferSettings, TransferTransport};
 use crate::transport::{ScatteringOrder, SourceRadiance};
 use glam::DVec3;
 use std::time::Instant;
@@ -28,6 +29,8 @@ pub enum Route {
     /// At the Gaussians' centres, as the paper does. The order is that of [`RenderSettings`], and single scattering
     /// alone has no multiple scattering, whatever these settings say.
     Centres(CentreSettings),
+    /// From the transfer that was baked for the frame (Zhang et al. 2013): any light, but one medium.
+    Transfer(TransferSettings),
 }
 
 /// The dials of an image.
@@ -67,6 +70,24 @@ pub enum RenderError {
     /// The centres' route refuses its input.
     #[error(transparent)]
     Centres(#[from] CentreError),
+    /// The transfer is none of this frame's density.
+    #[error(transparent)]
+    Transfer(#[from] TransferError),
+    /// The frame has no transfer.
+    #[error("the frame has no transfer, expected one; bake the sequence with --transfer")]
+    NoTransfer,
+    /// The transfer belongs to another medium.
+    #[error(
+        "medium.{name}: found {found}, expected {baked}, which the transfer was baked for; render with another method, or bake it for this medium"
+    )]
+    OtherMedium {
+        /// Which parameter.
+        name: &'static str,
+        /// What the scene asks for.
+        found: String,
+        /// What was baked.
+        baked: String,
+    },
     /// The centres' route needs Gaussians that are round in the world.
     #[error(
         "the map from voxels to the world stretches or shears, expected a uniform scale for the route through centres; use the grid route"
@@ -87,7 +108,7 @@ pub enum RenderError {
     },
     /// Source radiance is solved for light from infinity only.
     #[error(
-        "light[{index}]: found a point, expected environment or directional: the compensated method solves for light from infinity only; use --method reference"
+        "light[{index}]: found a point, expected environment or directional: this method is for light from infinity only; use --method reference"
     )]
     PointLight {
         /// Which of the lights, from 0.
@@ -125,6 +146,7 @@ struct Loaded {
 enum Transport {
     Grid(GridTransport),
     Centres(Box<CentreTransport>, UnitPlacement),
+    Transfer(Box<TransferTransport>),
 }
 
 /// See the module's head.
@@ -170,6 +192,12 @@ impl Renderer {
                 let settings = CentreSettings { order: self.settings.sh_order, multiple, ..settings };
                 Transport::Centres(Box::new(CentreTransport::new(&frame.gaussians, settings)?), placement)
             }
+            Route::Transfer(settings) => {
+                check_box(frame.field.dims)?;
+                let transfer = frame.transfer.clone().ok_or(RenderError::NoTransfer)?;
+                check_medium(&self.medium, &transfer.medium)?;
+                Transport::Transfer(Box::new(TransferTransport::new(&frame.field, transfer, settings)?))
+            }
         };
         self.loaded = Some(Loaded { frame, transport });
         Ok(())
@@ -201,7 +229,7 @@ impl Renderer {
             None => {
                 let beams = match self.settings.route {
                     Route::Grid(grid) => self.beams.get_or_insert_with(|| beams(&self.lights, grid.beams)).as_slice(),
-                    Route::Centres(_) => &[],
+                    Route::Centres(_) | Route::Transfer(_) => &[],
                 };
                 self.source.insert(solve(loaded, &self.settings, &self.medium, &self.lights, beams)?)
             }
@@ -247,6 +275,12 @@ fn solve(
             let marched = MarchMedium::of(medium.sigma_t, radiance.sigma_t);
             (Box::new(CentreSource::new(transport.points().clone(), radiance, frame, *placement)), marched)
         }
+        Transport::Transfer(transport) => {
+            let transfer = frame.transfer.as_ref().ok_or(RenderError::NoTransfer)?;
+            check_medium(medium, &transfer.medium)?;
+            let source = transport.light(&frame.field, lights, settings.scattering);
+            (Box::new(source), MarchMedium::plain(medium.sigma_t))
+        }
     })
 }
 
@@ -257,6 +291,20 @@ pub(crate) fn check_box(dims: [usize; 3]) -> Result<(), RenderError> {
     match rays.iter().all(|&rays| rays <= MOST_RAYS) {
         true => Ok(()),
         false => Err(RenderError::TooLong { dims }),
+    }
+}
+
+/// Refuses a medium that transfer was not baked for.
+fn check_medium(asked: &MediumParameters, baked: &MediumParameters) -> Result<(), RenderError> {
+    let colours = |name, asked: [f32; 3], baked: [f32; 3]| match asked == baked {
+        true => Ok(()),
+        false => Err(RenderError::OtherMedium { name, found: format!("{asked:?}"), baked: format!("{baked:?}") }),
+    };
+    colours("sigma_t", asked.sigma_t, baked.sigma_t)?;
+    colours("albedo", asked.albedo, baked.albedo)?;
+    match asked.g == baked.g {
+        true => Ok(()),
+        false => Err(RenderError::OtherMedium { name: "g", found: asked.g.to_string(), baked: baked.g.to_string() }),
     }
 }
 

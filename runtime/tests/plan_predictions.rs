@@ -97,6 +97,7 @@ fn plume(number: i32) -> Frame {
         unit: UnitSpace::of_box(grid.origin, grid.dims.map(|d| d as u32)),
         first_node: grid.origin.map(|o| o - 1),
         world_from_index: grid.world_from_index,
+        transfer: None,
     }
 }
 

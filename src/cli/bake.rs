@@ -3,6 +3,7 @@
 use super::{ProgressMode, positive, threads};
 use clap::{Args, ValueEnum};
 use smoke_formats::sequence::FrameSelection;
+use smoke_runtime::sphere::light_basis::BasisKind;
 use std::path::PathBuf;
 
 /// How the addresses of the residual's voxels are stored.
@@ -45,6 +46,29 @@ pub enum AtRest {
     Compressed,
     /// Ready to be mapped and uploaded.
     Raw,
+}
+
+fn basis(text: &str) -> Result<BasisKind, String> {
+    BasisKind::of_name(text).ok_or_else(|| "expected dsf or hat and 42, 162, 642 or 2562, or sh1 to sh6".into())
+}
+
+fn cell(text: &str) -> Result<u32, String> {
+    let shift = (0..=4).find(|shift| text == (1u32 << shift).to_string());
+    shift.ok_or_else(|| "expected 1, 2, 4, 8 or 16".into())
+}
+
+fn bytes(text: &str) -> Result<u64, String> {
+    let split = text.find(|c: char| c.is_ascii_alphabetic()).unwrap_or(text.len());
+    let unit = match &text[split..] {
+        "KiB" => Some(1u64 << 10),
+        "MiB" => Some(1 << 20),
+        "GiB" => Some(1 << 30),
+        "" | "B" => Some(1),
+        _ => None,
+    };
+    let number: Option<u64> = text[..split].trim().parse().ok();
+    let bytes = number.zip(unit).and_then(|(number, unit)| number.checked_mul(unit)).filter(|bytes| *bytes > 0);
+    bytes.ok_or_else(|| "expected a whole number of B, KiB, MiB or GiB".into())
 }
 
 /// Options of `bake`.
@@ -115,6 +139,33 @@ pub struct BakeArgs {
     /// Every N-th frame can be read alone; those between are smaller, and need the ones before them back to there.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64))]
     pub key_every: u32,
+    /// Bake the light's transfer too: dsf, hat and a number of directions (42, 162, 642, 2562), or sh1 to sh6.
+    #[arg(long, value_name = "BASIS", value_parser = basis, requires = "medium")]
+    pub transfer: Option<BasisKind>,
+    /// Scene file whose medium the transfer is for.
+    #[arg(long, value_name = "SCENE", requires = "transfer")]
+    pub medium: Option<PathBuf>,
+    /// Frames that get transfer [default: all that are baked].
+    #[arg(long, value_name = "RANGE", requires = "transfer")]
+    pub transfer_frames: Option<FrameSelection>,
+    /// Clusters of the transfer's rows; 1 for plain principal components.
+    #[arg(long, value_name = "N", default_value_t = 128, value_parser = clap::value_parser!(u32).range(1..=256))]
+    pub clusters: u32,
+    /// Directions of each cluster.
+    #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u32).range(0..=255))]
+    pub terms: u32,
+    /// Photons for each face of a voxel on the border and light of the indirect basis; 0 for no indirect light.
+    #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u32).range(0..=10_000))]
+    pub photons: u32,
+    /// Voxels along a side of a cell of indirect light: 1, 2, 4, 8 or 16.
+    #[arg(long, value_name = "VOXELS", default_value = "2", value_parser = cell)]
+    pub transfer_cell: u32,
+    /// Frames in a row that share the transfer's clusters.
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1024))]
+    pub transfer_run: u32,
+    /// Memory for the transfer's matrices, such as 4GiB or 500MiB; photons fly twice where it is short.
+    #[arg(long, value_name = "BYTES", default_value = "4GiB", value_parser = bytes)]
+    pub memory: u64,
     /// Replace negative and non-finite densities by zero, and report them, instead of stopping.
     #[arg(long)]
     pub clamp: bool,

@@ -12,7 +12,9 @@ mod sweep;
 pub use bake::{AtRest, BakeArgs, GaussianCount, ResidualAddress, TeleportRule};
 pub use compare::{CompareArgs, Picture};
 pub use plan::PlanArgs;
-pub use render::{Detail, ExponentialChoice, MethodChoice, MultipleChoice, RenderArgs, RouteChoice, ScatteringOrders};
+pub use render::{
+    Detail, ExponentialChoice, MethodChoice, MultipleChoice, RenderArgs, RouteChoice, ScatteringOrders, SunChoice,
+};
 pub use sweep::{ALL_RUNGS, Assignment, SweepArgs};
 
 use clap::{Args, Parser, Subcommand, ValueEnum};

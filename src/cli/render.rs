@@ -14,6 +14,8 @@ pub enum MethodChoice {
     Auto,
     /// Source radiance and a march: fast (Zhou et al. 2008, with its errors mended).
     Compensated,
+    /// From the transfer that was baked with the pack: any light at once, in its medium (Zhang et al. 2013).
+    Transfer,
     /// Unbiased path tracing: slow, and as exact as it is long.
     Reference,
 }
@@ -86,6 +88,16 @@ pub enum MultipleChoice {
     Integral,
     /// Diffusion between centres, the paper's, corrected.
     Diffusion,
+}
+
+/// What a directional light brings directly, where light is baked.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum SunChoice {
+    /// Swept when it is rendered: sharp shadows.
+    #[default]
+    Sharp,
+    /// From the pack: a lobe as wide as the basis's directions are apart.
+    Lobes,
 }
 
 /// How much of a frame is decoded.
@@ -163,6 +175,9 @@ pub struct RenderArgs {
     /// Light scattered more than once [default: transport with route grid, integral with route centres].
     #[arg(long, value_enum)]
     pub multiple: Option<MultipleChoice>,
+    /// What directional lights bring directly (method transfer) [default: sharp].
+    #[arg(long, value_enum)]
+    pub suns: Option<SunChoice>,
     /// Voxels between samples along a ray [default: 1, less where the medium is thick].
     #[arg(long, value_name = "VOXELS", value_parser = march_step)]
     pub march_step: Option<f64>,

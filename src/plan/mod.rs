@@ -120,7 +120,7 @@ fn unbaked(grid: &DensityGrid) -> Frame {
     let field = DensityField::from_box(grid.origin, grid.dims, &grid.values, grid.world_from_index);
     let unit = UnitSpace::of_box(grid.origin, grid.dims.map(|d| d as u32));
     let first_node = grid.origin.map(|o| o.saturating_sub(1));
-    Frame { field, gaussians: Vec::new(), unit, first_node, world_from_index: grid.world_from_index }
+    Frame { field, gaussians: Vec::new(), unit, first_node, world_from_index: grid.world_from_index, transfer: None }
 }
 
 fn planned(

@@ -86,7 +86,7 @@ pub fn render(
             Err(why) => return Ok(Err(why)),
         };
         let start = Instant::now();
-        let frame = render::read(pack, position, detail)?;
+        let frame = render::read(pack, position, method, detail)?;
         let decode = ("decode", start.elapsed().as_secs_f64());
         match maker.image(frame, &mut |_| {}) {
             Ok(image) => runs.push((Seconds::new([decode].into_iter().chain(image.seconds)), image.film)),

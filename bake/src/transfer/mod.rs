@@ -4,6 +4,7 @@
 //! scattered more often), each [`reduce`]d to short rows and [`clusters`] of them. Frames of a run share their clusters.
 //! What this gives is what the pack holds and the runtime lights: [`smoke_runtime::transport::transfer`].
 
+pub mod at_rest;
 pub mod clusters;
 pub mod photons;
 pub mod reduce;
@@ -78,7 +79,7 @@ fn distinct<T: PartialEq + Copy>(values: [T; 3]) -> (Vec<T>, [usize; 3]) {
 }
 
 /// Where a bake is.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Stage {
     /// Sweeps done, of so many.
     Direct,
@@ -88,8 +89,8 @@ pub enum Stage {
     Compress,
 }
 
-/// Wall seconds of a run, by stage.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+/// Wall seconds of a run, by stage, and the memory that it took.
+#[derive(Clone, Copy, Debug, Default, PartialEq, serde::Deserialize, serde::Serialize)]
 pub struct TransferSeconds {
     /// Sweeps.
     pub direct: f64,
@@ -97,6 +98,8 @@ pub struct TransferSeconds {
     pub photons: f64,
     /// Reducing and clustering.
     pub compress: f64,
+    /// Bytes of the largest matrices that were there at a time.
+    pub peak_bytes: u64,
 }
 
 /// Clusters that the frames of a run share, with the rows of each.
@@ -129,8 +132,6 @@ pub struct RunTransfer {
     pub truncated: f64,
     /// Where the time went.
     pub seconds: TransferSeconds,
-    /// Bytes of the largest matrices that were there at a time.
-    pub peak_bytes: u64,
 }
 
 /// Bakes the transfer of a run of frames, for light of `basis` (that of the settings) and indirect light of its coarser
@@ -155,7 +156,7 @@ pub fn bake_run(
         };
         let reduced = visibility(fields, basis, sigma_t, rank(0), &done);
         out.seconds.direct += start.elapsed().as_secs_f64();
-        out.peak_bytes = out.peak_bytes.max(4 * reduced.rows.len() as u64 * 2);
+        out.seconds.peak_bytes = out.seconds.peak_bytes.max(4 * reduced.rows.len() as u64 * 2);
         let rows: Vec<usize> =
             fields.iter().map(|f| smoke_runtime::transport::transfer::lit_nodes::lit_nodes(f).len()).collect();
         let start = Instant::now();
@@ -237,7 +238,8 @@ fn indirect(
     let Ok(reduced) = sketch(total, lights * n, rank, &columns, &mut trace);
     observe(Stage::Compress, 0, 1);
     let widest = parts.iter().map(|p| p.len()).max().unwrap_or(0);
-    out.peak_bytes = out.peak_bytes.max(4 * (2 * total * widest * n + total * rank) as u64);
+    let peak = 4 * (2 * total * widest * n + total * rank) as u64;
+    out.seconds.peak_bytes = out.seconds.peak_bytes.max(peak);
     out.indirect.push(shared(&reduced, lights * n, &rows, settings));
     out.photons += counted;
     out.truncated = out.truncated.max(truncated);

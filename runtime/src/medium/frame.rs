@@ -2,10 +2,12 @@
 
 use super::decoder::{decode_field, decode_gaussians};
 use super::field::DensityField;
+use crate::transport::transfer::frame::FrameTransfer;
 use glam::{DAffine3, DMat3, DVec3};
 use smoke_formats::gaussian::{Gaussian, UnitSpace};
 use smoke_formats::pack::Pack;
 use smoke_formats::residual::ResidualCodes;
+use std::sync::Arc;
 
 /// A decoded frame.
 #[derive(Clone, Debug)]
@@ -20,6 +22,8 @@ pub struct Frame {
     pub first_node: [i32; 3],
     /// Index to world space.
     pub world_from_index: DAffine3,
+    /// Its precomputed transfer, where that was read too.
+    pub transfer: Option<Arc<FrameTransfer>>,
 }
 
 impl Frame {
@@ -32,7 +36,8 @@ impl Frame {
         world_from_index: DAffine3,
     ) -> Self {
         let field = decode_field(&gaussians, residual, step, &unit, world_from_index);
-        Self { field, gaussians, unit, first_node: residual.origin.map(|o| o.saturating_sub(1)), world_from_index }
+        let first_node = residual.origin.map(|o| o.saturating_sub(1));
+        Self { field, gaussians, unit, first_node, world_from_index, transfer: None }
     }
 
     /// Frame `number`, counted from 0, of a pack.
@@ -45,6 +50,12 @@ impl Frame {
         Ok(Self::decode(gaussians, &codes, pack.frames()[number].step, unit, world_from_index))
     }
 
+    /// Frame `number`, counted from 0, of a pack, with its transfer.
+    pub fn read_with_transfer(pack: &Pack, number: usize) -> smoke_formats::Result<Self> {
+        let transfer = FrameTransfer::read(pack, number)?;
+        Ok(Self { transfer: Some(Arc::new(transfer)), ..Self::read(pack, number)? })
+    }
+
     /// Frame `number`, counted from 0, of a pack, by its Gaussians alone: the residual is not even read.
     pub fn read_gaussians(pack: &Pack, number: usize) -> smoke_formats::Result<Self> {
         let gaussians = pack.gaussians(number)?;
@@ -54,7 +65,8 @@ impl Frame {
         let (origin, dims) = (record.origin, record.dims);
         let density = decode_gaussians(&gaussians, origin, dims, record.step, &unit);
         let field = DensityField::from_box(origin, dims.map(|d| d as usize), &density, world_from_index);
-        Ok(Self { field, gaussians, unit, first_node: origin.map(|o| o.saturating_sub(1)), world_from_index })
+        let first_node = origin.map(|o| o.saturating_sub(1));
+        Ok(Self { field, gaussians, unit, first_node, world_from_index, transfer: None })
     }
 
     /// Unit space to world.

@@ -30,6 +30,7 @@ impl Rung {
         match self.settings.map(|s| s.route) {
             Some(Route::Grid(_)) => "grid",
             Some(Route::Centres(_)) => "centres",
+            Some(Route::Transfer(_)) => "transfer",
             None => REFERENCE,
         }
     }
@@ -139,7 +140,7 @@ mod tests {
         let mut large = crate::plan::tests::survey(1.0, 0.9, 0.0);
         let step = |survey: &Survey| match rung("fine").unwrap().settings_for(survey).unwrap().route {
             Route::Grid(grid) => grid.multiple_step,
-            Route::Centres(_) => panic!("fine is of the grid"),
+            Route::Centres(_) | Route::Transfer(_) => panic!("fine is of the grid"),
         };
         assert_eq!(step(&large), 1);
         large.medium.dims = [500; 3];

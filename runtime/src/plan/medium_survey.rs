@@ -158,6 +158,7 @@ pub(crate) mod tests {
             unit: UnitSpace::of_box([0; 3], dims.map(|d| d as u32)),
             first_node: [-1; 3],
             world_from_index: map,
+            transfer: None,
         }
     }
 

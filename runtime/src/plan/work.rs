@@ -46,6 +46,8 @@ fn compensated(settings: &RenderSettings, survey: &Survey) -> [f64; 3] {
             };
             (single + multiple, all_nodes)
         }
+        // Lights clusters, not nodes; no rung uses it, as a pack may be without.
+        Route::Transfer(_) => (0.0, all_nodes),
         Route::Centres(_) => {
             let gaussians = medium.gaussians.map_or(0.0, |g| g.count as f64);
             (gaussians.powf(1.4), all_nodes * gaussians.powf(0.6))

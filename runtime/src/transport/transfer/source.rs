@@ -22,9 +22,9 @@ use crate::product::add_product;
 use crate::sphere::harmonics::evaluate;
 use crate::sphere::light_basis::BasisKind;
 use crate::tracking::phase;
-use crate::transport::SourceRadiance;
 use crate::transport::compensated::grid::columns::SweepGrid;
 use crate::transport::compensated::grid::single::transmittance_from;
+use crate::transport::{ScatteringOrder, SourceRadiance};
 use glam::{DVec3, Vec3, Vec4};
 use rayon::prelude::*;
 use std::sync::Arc;
@@ -111,7 +111,7 @@ impl TransferTransport {
     }
 
     /// Lights the frame `field`, the same as at [`Self::new`]; points count for nothing.
-    pub fn light(&mut self, field: &DensityField, lights: &[Light]) -> TransferSource {
+    pub fn light(&mut self, field: &DensityField, lights: &[Light], scattering: ScatteringOrder) -> TransferSource {
         let transfer = self.transfer.clone();
         let basis = &transfer.basis;
         let (suns, rest): (Vec<&Light>, Vec<&Light>) =
@@ -127,7 +127,8 @@ impl TransferTransport {
             })
             .collect();
         let suns = suns.into_iter().filter_map(|sun| self.sweep(field, sun)).collect();
-        let moments = moments(&transfer, &self.cells, &transfer.indirect_basis.coefficients(lights));
+        let indirect: &[Light] = if scattering == ScatteringOrder::Single { &[] } else { lights };
+        let moments = moments(&transfer, &self.cells, &transfer.indirect_basis.coefficients(indirect));
         let mut source = TransferSource {
             nodes: self.nodes.clone(),
             cells: self.cells.clone(),
