@@ -1,6 +1,6 @@
 //! Precomputed volume radiance transfer (Zhang, Dong and Ma 2013): what the smoke sends out under each light of a basis.
 //!
-//! A run of frames, in order: [`visibility`] (how much of each direction reaches each voxel) and [`photons`] (what is
+//! A run of frames, in order: [`mod@visibility`] (how much of each direction reaches each voxel) and [`photons`] (what is
 //! scattered more often), each [`reduce`]d to short rows and [`clusters`] of them. Frames of a run share their clusters.
 //! What this gives is what the pack holds and the runtime lights: [`smoke_runtime::transport::transfer`].
 
@@ -285,6 +285,7 @@ fn shared(reduced: &Reduced, length: usize, rows: &[usize], settings: &TransferS
 }
 
 #[cfg(test)]
+#[expect(clippy::single_range_in_vec_init, reason = "parts are a list of ranges, here of one")]
 mod tests {
     use super::*;
 

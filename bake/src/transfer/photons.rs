@@ -62,6 +62,9 @@ pub struct PhotonSettings {
     pub lowest_order: u32,
 }
 
+/// The row that a flight adds, of the photon's first direction (to the light) and the harmonics of the flight's.
+type Spread<'a> = dyn FnMut(DVec3, &[f32], &mut [f32]) + 'a;
+
 /// What came of the photons.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Traced {
@@ -280,7 +283,7 @@ impl<'a> Photons<'a> {
                        flight: &mut [f32],
                        sums: &mut [f32],
                        random: &mut Random,
-                       spread: &mut dyn FnMut(DVec3, &[f32], &mut [f32])| {
+                       spread: &mut Spread| {
                 let harmonics = evaluate(self.settings.bands, -way);
                 spread(toward, &harmonics[..n], flight);
                 self.fly(ray, power * weight, flight, sums, random)
@@ -420,7 +423,7 @@ fn active_box(field: &DensityField, cells: &Cells) -> ([DVec3; 2], u64) {
     let n = [0, 1, 2].map(|a| (high[a] - low[a]) as u64);
     let side = 1usize << cells.shift;
     let corner = |at: [usize; 3]| DVec3::from_array([0, 1, 2].map(|a| ((at[a] * side).min(field.dims[a] - 1)) as f64));
-    ([corner(low), corner(high)], 2 * (n[0] * n[1] + n[1] * n[2] + n[2] * n[0]) << (2 * cells.shift))
+    ([corner(low), corner(high)], (2 * (n[0] * n[1] + n[1] * n[2] + n[2] * n[0])) << (2 * cells.shift))
 }
 
 #[cfg(test)]

@@ -129,6 +129,7 @@ fn orthonormal(matrix: &[f32], width: usize) -> Vec<f32> {
 }
 
 #[cfg(test)]
+#[expect(clippy::single_range_in_vec_init, reason = "parts are a list of ranges, here of one")]
 mod tests {
     use super::*;
 
