@@ -73,33 +73,29 @@ impl ShadedVolume {
         assert_eq!(nodes.len(), dims.iter().product::<usize>(), "one value a node");
         let bricks = dims.map(|n| (n - 1).div_ceil(BRICK));
         let count = bricks.iter().product();
-        let copy = |b: usize| {
+        let corners = |b: usize| {
             let first = [b % bricks[0], b / bricks[0] % bricks[1], b / bricks[0] / bricks[1]].map(|b| b * BRICK);
-            let end = [0, 1, 2].map(|a| (first[a] + SIDE).min(dims[a]));
-            let rows = (first[2]..end[2]).flat_map(|k| (first[1]..end[1]).map(move |j| (j, k)));
-            let row = |(j, k): (usize, usize)| {
-                let start = dims[0] * (j + dims[1] * k);
-                &nodes[start + first[0]..start + end[0]]
-            };
-            if !rows.clone().any(|at| row(at).iter().any(|n| n[3] > 0.0)) {
-                return None;
-            }
-            let mut brick = [[0.0; 4]; BRICK_NODES];
-            for (j, k) in rows {
-                let source = row((j, k));
-                brick[SIDE * (j - first[1] + SIDE * (k - first[2]))..][..source.len()].copy_from_slice(source);
-            }
-            Some(brick)
+            (first, [0, 1, 2].map(|a| (first[a] + SIDE).min(dims[a])))
         };
-        let copies: Vec<_> = (0..count).into_par_iter().map(|b| copy(b).map(Box::new)).collect();
-        let (mut places, mut out) = (vec![EMPTY; count], Vec::new());
-        for (place, copy) in places.iter_mut().zip(copies) {
-            if let Some(copy) = copy {
-                *place = out.len() as u32;
-                out.push(*copy);
-            }
-        }
-        let density_max = nodes.iter().map(|n| n[3]).fold(0.0, f32::max);
+        let rows = |(first, end): ([usize; 3], [usize; 3])| {
+            let lines = (first[2]..end[2]).flat_map(move |k| (first[1]..end[1]).map(move |j| (j, k)));
+            lines.map(move |(j, k)| {
+                let start = dims[0] * (j + dims[1] * k);
+                let place = SIDE * (j - first[1] + SIDE * (k - first[2]));
+                (place, &nodes[start + first[0]..start + end[0]])
+            })
+        };
+        let is_dense = |b: &usize| rows(corners(*b)).any(|(_, row)| row.iter().any(|n| n[3] > 0.0));
+        let dense: Vec<usize> = (0..count).into_par_iter().filter(is_dense).collect();
+        let copy = |b: &usize| {
+            let mut brick = [[0.0; 4]; BRICK_NODES];
+            rows(corners(*b)).for_each(|(place, row)| brick[place..][..row.len()].copy_from_slice(row));
+            brick
+        };
+        let out: Vec<_> = dense.par_iter().map(copy).collect();
+        let mut places = vec![EMPTY; count];
+        dense.iter().enumerate().for_each(|(place, &b)| places[b] = place as u32);
+        let density_max = nodes.par_iter().map(|n| n[3]).reduce(|| 0.0, f32::max);
         Self { dims, nodes: out, places, bricks, world_from_node, density_max }
     }
 

@@ -12,7 +12,7 @@
 //! `sum A_k s_k` is all of it, so a bright texel keeps its flux wherever it lies. The paper samples a Gaussian around
 //! each node, which keeps 0.92 to 1.06 of it at best. A directional light of irradiance E goes to the corners of its
 //! triangle, `s_k = E b_k / A_k`: without the 1/A_k it would have no units.
-//! Cost: a search of a triangle for each texel, of at most [`TEXELS_ACROSS`] x half as many.
+//! Cost: a search of a triangle for each texel, of at most [`TEXELS_AN_EDGE`] an edge.
 
 use super::harmonics::{MAX_ORDER, evaluate};
 use super::icosphere::Icosphere;
@@ -20,8 +20,11 @@ use crate::light::{Environment, Light};
 use glam::{DMat3, DVec3, Vec3};
 use rayon::prelude::*;
 
-/// Environments wider than this are pooled first: 0.7 degrees a texel, a twelfth of an edge of 642 nodes.
-const TEXELS_ACROSS: usize = 512;
+/// Environments with more texels across than this for each edge of the mesh round the sphere are pooled first: a texel
+/// is then a sixth of an edge, and its flux and mean direction are exact.
+const TEXELS_AN_EDGE: usize = 6;
+/// The least of texels across that an environment is pooled to.
+const LEAST_ACROSS: usize = 128;
 /// Points along a side of a triangle in the quadrature of areas: 256 points a triangle.
 const AREA_POINTS: usize = 16;
 
@@ -242,8 +245,10 @@ impl LightBasis {
 
     /// Adds the integral of every function against the environment.
     fn add_environment(&self, environment: &Environment, sums: &mut [[f64; 3]]) {
-        let texels = environment.texels(TEXELS_ACROSS);
-        let rows = texels.par_chunks(TEXELS_ACROSS.max(texels.len().div_ceil(64)));
+        // Five edges of the icosahedron go round the sphere, each halved so many times.
+        let across = ((5 * TEXELS_AN_EDGE) << self.mesh.level()).max(LEAST_ACROSS);
+        let texels = environment.texels(across);
+        let rows = texels.par_chunks(texels.len().div_ceil(64).max(256));
         let parts = rows.map(|row| {
             // Nodes that this part of the sky touches, in the order in which they are met.
             let mut part = vec![[0.0; 3]; self.kind.len()];

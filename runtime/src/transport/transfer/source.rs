@@ -233,9 +233,6 @@ impl TransferSource {
     }
 }
 
-/// Nodes that one task shades.
-const BLOCK: usize = 4096;
-
 impl SourceRadiance for TransferSource {
     fn depends_on_view(&self) -> bool {
         self.transfer.medium.g != 0.0
@@ -258,9 +255,12 @@ impl SourceRadiance for TransferSource {
             }
         };
         let cells = self.seen_cells(field, eye);
-        let radiance = |first: usize, nodes: &[u32]| -> Vec<[f32; 3]> {
-            let mut out = Vec::with_capacity(nodes.len());
-            for (row, &node) in (first..).zip(nodes) {
+        let mut shaded: Vec<[f32; 4]> = Vec::new();
+        shaded.par_extend(rayon::iter::repeat_n([0.0; 4], field.values.len()));
+        // Slices along z: nodes are in order, so each has a range of them.
+        shaded.par_chunks_mut(nx * ny).enumerate().for_each(|(k, out)| {
+            let [start, end] = [k, k + 1].map(|k| self.nodes.partition_point(|&n| (n as usize) < nx * ny * k));
+            for (row, &node) in (start..).zip(&self.nodes[start..end]) {
                 let at = place(node);
                 let mut sum = Vec4::ZERO;
                 for (set, lit) in transfer.direct.iter().zip(lit) {
@@ -298,16 +298,9 @@ impl SourceRadiance for TransferSource {
                 }
                 // A truncated series can dip below zero; radiance cannot.
                 let sum = sum.max(Vec4::ZERO);
-                out.push([sum.x, sum.y, sum.z]);
+                out[node as usize - nx * ny * k] = [sum.x, sum.y, sum.z, field.values[node as usize]];
             }
-            out
-        };
-        let blocks = self.nodes.par_chunks(BLOCK).enumerate().map(|(b, nodes)| radiance(b * BLOCK, nodes));
-        let blocks: Vec<Vec<[f32; 3]>> = blocks.collect();
-        let mut shaded: Vec<[f32; 4]> = vec![[0.0; 4]; field.values.len()];
-        for (&node, [r, g, b]) in self.nodes.iter().zip(blocks.iter().flatten()) {
-            shaded[node as usize] = [*r, *g, *b, field.values[node as usize]];
-        }
+        });
         ShadedVolume::new(field.dims, &shaded, field.world_from_node)
     }
 }
