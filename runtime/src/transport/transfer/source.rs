@@ -14,7 +14,7 @@
 use super::cells::Cells;
 use super::frame::{Clustered, FrameTransfer};
 use super::lit_nodes::lit_nodes;
-use super::view_directions::{Between, ViewDirections};
+use super::view_directions::{Between, ViewDirections, squares};
 use crate::light::Light;
 use crate::march::ShadedVolume;
 use crate::medium::field::DensityField;
@@ -248,8 +248,10 @@ impl SourceRadiance for TransferSource {
         let (view, lit) = match &self.even {
             Some(lit) => (None, lit),
             None => {
-                let seen: Vec<Between> = self.nodes.par_iter().map(|&n| Between::of(along(place(n)))).collect();
-                let view = ViewDirections::of(seen.iter().copied());
+                let squares = squares(transfer.medium.g);
+                let between = |&node: &u32| Between::of(along(place(node)), squares);
+                let seen: Vec<Between> = self.nodes.par_iter().map(between).collect();
+                let view = ViewDirections::of(seen.iter().copied(), squares);
                 let lit = self.lit_clusters(view.directions());
                 (Some((view, seen)), &{ lit })
             }
@@ -260,6 +262,7 @@ impl SourceRadiance for TransferSource {
         // Slices along z: nodes are in order, so each has a range of them.
         shaded.par_chunks_mut(nx * ny).enumerate().for_each(|(k, out)| {
             let [start, end] = [k, k + 1].map(|k| self.nodes.partition_point(|&n| (n as usize) < nx * ny * k));
+            let mut line = (usize::MAX, Vec::new());
             for (row, &node) in (start..).zip(&self.nodes[start..end]) {
                 let at = place(node);
                 let mut sum = Vec4::ZERO;
@@ -291,11 +294,10 @@ impl SourceRadiance for TransferSource {
                     };
                     (0..3).for_each(|c| sum[c] += scattered * sun.power[c] * sun.transmittance[c][row]);
                 }
-                for (cell, weight) in self.cells.around(at) {
-                    if weight > 0.0 {
-                        sum += cells[cell as usize] * weight;
-                    }
+                if line.0 != at[1] {
+                    line = (at[1], self.cells.line([at[1], at[2]], &cells));
                 }
+                sum += self.cells.between(at[0], &line.1);
                 // A truncated series can dip below zero; radiance cannot.
                 let sum = sum.max(Vec4::ZERO);
                 out[node as usize - nx * ny * k] = [sum.x, sum.y, sum.z, field.values[node as usize]];
@@ -318,7 +320,9 @@ impl TransferSource {
         }
         let seen = |(moments, middle): (&[Vec4], &DVec3)| {
             let harmonics = evaluate(self.transfer.bands, (*middle - eye).normalize_or(DVec3::Z).as_vec3());
-            moments.iter().zip(harmonics).fold(Vec4::ZERO, |sum, (m, y)| sum + *m * y)
+            let sum = moments.iter().zip(harmonics).fold(Vec4::ZERO, |sum, (m, y)| sum + *m * y);
+            // The last component counts cells, see [`Cells::line`].
+            sum.with_w(1.0)
         };
         self.moments.par_chunks_exact(n).zip(&middles).map(seen).collect()
     }

@@ -1,17 +1,20 @@
 //! The directions from the eye to the smoke, on a grid: what depends on direction alone is found once for each.
 //!
-//! A cube around the eye has [`PER_FACE`] x [`PER_FACE`] squares a face, 3.6 degrees at most; only corners of squares that
-//! the smoke is seen through are used. Between corners values are bilinear: a band l of a function is off by
-//! `l (l + 1) h^2 / 8`, h = 0.0625 radians: 0.6 % of band 3, 2 % of band 6. For an orthographic view all of it would be
-//! one direction (Zhang et al. 2013, Eq. 20, evaluates one for each cluster, which is right for that view only).
+//! A cube around the eye has [`squares`] squares along a side of a face, the more the stronger light is scattered forward
+//! or back; only corners of squares that the smoke is seen through are used. Between corners values are bilinear: a band l
+//! of a function is off by `l (l + 1) h^2 / 8`, h the angle of a square, 0.1 radians at g = 0.5: 1.5 % of band 3, which
+//! has an eighth of the light. For an orthographic view all of it would be one direction (Zhang et al. 2013, Eq. 20,
+//! evaluates one for each cluster, which is right for that view only).
 //! Cost: a few operations a node, once for the marks and once for the read.
 
 use glam::DVec3;
 
-/// Squares along a side of a face of the cube.
-pub const PER_FACE: usize = 32;
-const CORNERS: usize = PER_FACE + 1;
 const UNUSED: u32 = u32::MAX;
+
+/// Squares along a side of a face of the cube: about five across the peak of a phase function, 12 to 64.
+pub fn squares(g: f32) -> usize {
+    ((10.0 / (1.0 - g.abs())) as usize).clamp(12, 64)
+}
 
 /// The corners in use.
 pub struct ViewDirections {
@@ -19,6 +22,7 @@ pub struct ViewDirections {
     places: Vec<u32>,
     /// Their unit directions from the eye.
     directions: Vec<DVec3>,
+    squares: usize,
 }
 
 /// A direction between four corners.
@@ -29,9 +33,10 @@ pub struct Between {
 }
 
 impl Between {
-    /// The square of a vector from the eye of any length above 0; a zero vector counts as +x.
+    /// The square of a vector from the eye of any length above 0, where a side of a face has so many; a zero vector counts
+    /// as +x.
     #[inline(always)]
-    pub fn of(v: DVec3) -> Self {
+    pub fn of(v: DVec3, squares: usize) -> Self {
         let size = v.abs();
         let axis = if size.x >= size.y && size.x >= size.z {
             0
@@ -46,34 +51,36 @@ impl Between {
             _ => [v.z, v.x, v.y],
         };
         let scale = if major != 0.0 { 1.0 / major.abs() } else { 0.0 };
-        let place = [one, other].map(|c| (c * scale + 1.0) * (0.5 * PER_FACE as f64));
-        let low = place.map(|p| (p as usize).min(PER_FACE - 1));
+        let place = [one, other].map(|c| (c * scale + 1.0) * (0.5 * squares as f64));
+        let low = place.map(|p| (p as usize).min(squares - 1));
         let face = 2 * axis + usize::from(major < 0.0);
         let fraction = [0, 1].map(|a| (place[a] - low[a] as f64) as f32);
-        Self { square: (face * CORNERS + low[1]) * CORNERS + low[0], fraction }
+        let corners = squares + 1;
+        Self { square: (face * corners + low[1]) * corners + low[0], fraction }
     }
 
-    fn corners(&self) -> [usize; 4] {
-        [self.square, self.square + 1, self.square + CORNERS, self.square + CORNERS + 1]
+    fn corners(&self, squares: usize) -> [usize; 4] {
+        let next = self.square + squares + 1;
+        [self.square, self.square + 1, next, next + 1]
     }
 }
 
 impl ViewDirections {
-    /// The corners of the squares that any of `seen`, vectors from the eye, lie in.
-    pub fn of(seen: impl Iterator<Item = Between>) -> Self {
-        let mut marks = vec![false; 6 * CORNERS * CORNERS];
+    /// The corners of the squares that any of `seen`, made with as many squares, lie in.
+    pub fn of(seen: impl Iterator<Item = Between>, squares: usize) -> Self {
+        let mut marks = vec![false; 6 * (squares + 1) * (squares + 1)];
         seen.for_each(|between| marks[between.square] = true);
         let mut places = vec![UNUSED; marks.len()];
         let mut directions = Vec::new();
         for square in (0..marks.len()).filter(|&s| marks[s]) {
-            for corner in (Between { square, fraction: [0.0; 2] }).corners() {
+            for corner in (Between { square, fraction: [0.0; 2] }).corners(squares) {
                 if places[corner] == UNUSED {
                     places[corner] = directions.len() as u32;
-                    directions.push(direction(corner));
+                    directions.push(direction(corner, squares));
                 }
             }
         }
-        Self { places, directions }
+        Self { places, directions, squares }
     }
 
     /// Unit directions from the eye.
@@ -86,14 +93,15 @@ impl ViewDirections {
     pub fn around(&self, between: Between) -> [(u32, f32); 4] {
         let [f, g] = between.fraction;
         let weights = [(1.0 - f) * (1.0 - g), f * (1.0 - g), (1.0 - f) * g, f * g];
-        let corners = between.corners();
+        let corners = between.corners(self.squares);
         [0, 1, 2, 3].map(|c| (self.places[corners[c]], weights[c]))
     }
 }
 
-fn direction(corner: usize) -> DVec3 {
-    let (face, row, column) = (corner / (CORNERS * CORNERS), corner / CORNERS % CORNERS, corner % CORNERS);
-    let place = [column, row].map(|p| 2.0 * p as f64 / PER_FACE as f64 - 1.0);
+fn direction(corner: usize, squares: usize) -> DVec3 {
+    let n = squares + 1;
+    let (face, row, column) = (corner / (n * n), corner / n % n, corner % n);
+    let place = [column, row].map(|p| 2.0 * p as f64 / squares as f64 - 1.0);
     let major = if face % 2 == 0 { 1.0 } else { -1.0 };
     let v = match face / 2 {
         0 => DVec3::new(major, place[0], place[1]),
@@ -111,9 +119,9 @@ mod tests {
     #[test]
     fn a_direction_lies_between_the_corners_of_its_square_whatever_its_face() {
         let seen: Vec<DVec3> = directions(5000).collect();
-        let view = ViewDirections::of(seen.iter().map(|v| Between::of(*v * 3.7)));
+        let view = ViewDirections::of(seen.iter().map(|v| Between::of(*v * 3.7, 32)), 32);
         for v in &seen {
-            let around = view.around(Between::of(*v));
+            let around = view.around(Between::of(*v, 32));
             assert!((around.iter().map(|a| a.1).sum::<f32>() - 1.0).abs() < 1e-6);
             let mean = around.iter().fold(DVec3::ZERO, |s, (d, w)| s + view.directions()[*d as usize] * f64::from(*w));
             // A linear function, off by h^2 / 8 at most.
@@ -124,12 +132,12 @@ mod tests {
 
     #[test]
     fn only_what_is_seen_is_used_and_odd_vectors_are_no_trouble() {
-        let view =
-            ViewDirections::of([DVec3::new(1.0, 0.1, 0.1), DVec3::new(1.0, 0.11, 0.1)].map(Between::of).into_iter());
+        let near = [DVec3::new(1.0, 0.1, 0.1), DVec3::new(1.0, 0.11, 0.1)].map(|v| Between::of(v, 12));
+        let view = ViewDirections::of(near.into_iter(), 12);
         assert_eq!(view.directions().len(), 4);
         for v in [DVec3::ZERO, DVec3::new(1.0, 1.0, 1.0), DVec3::new(-1.0, 1.0, -1.0), DVec3::new(0.0, -1e-300, 0.0)] {
-            let view = ViewDirections::of([v].map(Between::of).into_iter());
-            assert!(view.around(Between::of(v)).iter().all(|(d, w)| (*d as usize) < 4 && w.is_finite()));
+            let view = ViewDirections::of([v].map(|v| Between::of(v, 12)).into_iter(), 12);
+            assert!(view.around(Between::of(v, 12)).iter().all(|(d, w)| (*d as usize) < 4 && w.is_finite()));
         }
     }
 }
