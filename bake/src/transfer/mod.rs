@@ -19,6 +19,7 @@ use smoke_runtime::sphere::harmonics::BAND;
 use smoke_runtime::sphere::light_basis::{BasisKind, LightBasis};
 use smoke_runtime::transport::medium::MediumParameters;
 use smoke_runtime::transport::transfer::cells::Cells;
+use smoke_runtime::transport::transfer::lit_nodes::lit_nodes;
 use std::ops::Range;
 use std::time::Instant;
 use visibility::visibility;
@@ -148,6 +149,7 @@ pub fn bake_run(
     let (extinctions, _) = settings.extinctions();
     let sweeps = (2 * extinctions.len() * fields.len() * basis.areas().len()) as u64;
     let swept = std::sync::atomic::AtomicU64::new(0);
+    let rows: Vec<usize> = fields.iter().map(|field| lit_nodes(field).len()).collect();
     for &sigma_t in &extinctions {
         let start = Instant::now();
         let done = |sweeps_done: u64| {
@@ -157,8 +159,6 @@ pub fn bake_run(
         let reduced = visibility(fields, basis, sigma_t, rank(0), &done);
         out.seconds.direct += start.elapsed().as_secs_f64();
         out.seconds.peak_bytes = out.seconds.peak_bytes.max(4 * reduced.rows.len() as u64 * 2);
-        let rows: Vec<usize> =
-            fields.iter().map(|f| smoke_runtime::transport::transfer::lit_nodes::lit_nodes(f).len()).collect();
         let start = Instant::now();
         observe(Stage::Compress, 0, 1);
         out.direct.push(shared(&reduced, basis.areas().len(), &rows, settings));

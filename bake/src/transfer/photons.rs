@@ -22,7 +22,7 @@ use rayon::prelude::*;
 use smoke_runtime::medium::field::DensityField;
 use smoke_runtime::sphere::harmonics::evaluate;
 use smoke_runtime::sphere::light_basis::{BasisKind, LightBasis};
-use smoke_runtime::tracking::flight::{Column, Ray, Space};
+use smoke_runtime::tracking::flight::{Column, Ray, Space, Steps};
 use smoke_runtime::tracking::phase;
 use smoke_runtime::tracking::sampler::{Random, Strata, mix};
 use smoke_runtime::transport::transfer::cells::Cells;
@@ -337,22 +337,15 @@ impl<'a> Photons<'a> {
     fn fly(&self, ray: &Ray, power: f32, flight: &[f32], sums: &mut [f32], random: &mut Random) -> Option<f64> {
         let majorants = &self.cells.majorants;
         let (near, far) = majorants.span(ray.origin, ray.direction)?;
-        let mut remaining = random.exponential();
+        let mut steps = Steps::new(random);
         let mut hit = None;
         majorants.walk_bricks(ray.origin, ray.direction, near, far, |from, to, brick| {
             let bound = majorants.bounds[brick][1];
             let (rate, per_bound) = (self.medium.sigma_t * bound, 1.0 / bound);
             let mut t = from;
-            loop {
-                let next = t + f64::from(remaining / rate);
-                // Not "next >= to": an infinite or undefined distance lies beyond every cell.
-                let inside = next < to;
-                if !inside {
-                    remaining = (remaining - rate * (to - t) as f32).max(0.0);
-                    break;
-                }
+            while let Some(next) = steps.next(t, to, rate) {
                 t = next;
-                remaining = random.exponential();
+                steps.draw(random);
                 if random.unit() < self.space.density(ray.at(t)) * per_bound {
                     hit = Some(t);
                     break;

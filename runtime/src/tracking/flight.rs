@@ -65,6 +65,36 @@ impl Extinction {
     }
 }
 
+/// The tentative collisions of one flight: what is left of the optical depth to the next, from brick to brick.
+pub struct Steps(f32);
+
+impl Steps {
+    /// The first is drawn.
+    #[inline(always)]
+    pub fn new(random: &mut Random) -> Self {
+        Self(random.exponential())
+    }
+
+    /// Distance of the tentative collision after `from` where they come at `rate` up to `to`; none if it lies beyond, and
+    /// then the next brick goes on with what is left.
+    #[inline(always)]
+    pub fn next(&mut self, from: f64, to: f64, rate: f32) -> Option<f64> {
+        let next = from + f64::from(self.0 / rate);
+        // Not "next >= to": an infinite or undefined distance lies beyond every brick.
+        if next < to {
+            return Some(next);
+        }
+        self.0 = (self.0 - rate * (to - from) as f32).max(0.0);
+        None
+    }
+
+    /// Draws the way to the one after.
+    #[inline(always)]
+    pub fn draw(&mut self, random: &mut Random) {
+        self.0 = random.exponential();
+    }
+}
+
 /// A frame's density with its bounds.
 pub struct Space<'a> {
     field: &'a DensityField,
@@ -144,20 +174,14 @@ impl<'a> Space<'a> {
         random: &mut Random,
     ) -> Option<f64> {
         let (near, far) = self.span(ray)?;
-        let mut remaining = random.exponential();
+        let mut steps = Steps::new(random);
         let mut hit = None;
         self.majorants.walk(ray.origin, ray.direction, near, far.min(end), |from, to, [_, bound]| {
             let rate = extinction.max * bound;
             let per_bound = 1.0 / bound;
             let mut t = from;
             loop {
-                let next = t + f64::from(remaining / rate);
-                // Not "next >= to": an infinite or undefined distance lies beyond every brick.
-                let inside = next < to;
-                if !inside {
-                    remaining = (remaining - rate * (to - t) as f32).max(0.0);
-                    return false;
-                }
+                let Some(next) = steps.next(t, to, rate) else { return false };
                 t = next;
                 let q = (self.density(ray.at(t)) * per_bound).clamp(0.0, 1.0);
                 let u = random.unit();
@@ -176,7 +200,7 @@ impl<'a> Space<'a> {
                     }
                     *weight *= (Vec3::ONE - q) / (1.0 - real);
                 }
-                remaining = random.exponential();
+                steps.draw(random);
             }
         });
         hit
@@ -187,16 +211,12 @@ impl<'a> Space<'a> {
     pub fn transmittance(&self, ray: &Ray, end: f64, extinction: &Extinction, random: &mut Random) -> Vec3 {
         let Some((near, far)) = self.span(ray) else { return Vec3::ONE };
         let (mut factor, mut depth, mut deep) = (Vec3::ONE, 0.0f32, DEEP);
-        let mut remaining = random.exponential();
+        let mut steps = Steps::new(random);
         self.majorants.walk(ray.origin, ray.direction, near, far.min(end), |from, to, [low, high]| {
             let (rate, per_difference) = (extinction.max * (high - low), 1.0 / (high - low));
             let mut t = from;
             loop {
-                let next = t + f64::from(remaining / rate);
-                // Not "next >= to": an infinite or undefined distance lies beyond every brick.
-                let inside = next < to;
-                if !inside {
-                    remaining = (remaining - rate * (to - t) as f32).max(0.0);
+                let Some(next) = steps.next(t, to, rate) else {
                     depth += extinction.max * low * (to - from) as f32;
                     if depth > deep {
                         if random.unit() < 0.75 {
@@ -207,7 +227,7 @@ impl<'a> Space<'a> {
                         deep = depth + FAINTER;
                     }
                     return false;
-                }
+                };
                 t = next;
                 let q = ((self.density(ray.at(t)) - low) * per_difference).clamp(0.0, 1.0);
                 factor *= Vec3::ONE - extinction.ratio * q;
@@ -218,7 +238,7 @@ impl<'a> Space<'a> {
                     }
                     factor *= 4.0;
                 }
-                remaining = random.exponential();
+                steps.draw(random);
             }
         });
         let through = extinction.ratio * -depth;
