@@ -1,4 +1,4 @@
-//! What a transfer costs and how far off it is: the tables of `docs/transfer.md`.
+//! What a transfer costs and how far off it is: the tables of `docs/decisions/050-transfer.md`.
 //!
 //! ```console
 //! $ cargo run --release --example transfer_error -p smoke-baking -- plume.1040.vdb sunset.exr [TABLE ...]
@@ -53,7 +53,7 @@ fn main() {
         seed: 1,
         memory: 4 << 30,
     };
-    let fine = TransferSettings { clusters: 1, terms: 200, ..settings };
+    let fine = TransferSettings { clusters: 1, terms: 255, ..settings };
     let show = |name: String, settings: TransferSettings, dials: Dials| {
         for g in [0.0f32, 0.5] {
             let settings = TransferSettings { medium: medium(g), ..settings };
@@ -97,7 +97,7 @@ fn main() {
     }
     if wants("photons") {
         head();
-        for photons in [1, 10] {
+        for photons in [1, 10, 20] {
             show(
                 format!("{photons} photons a face, uncompressed"),
                 TransferSettings { photons, ..fine },

@@ -55,29 +55,33 @@ impl Clusters {
     }
 }
 
-/// Clusters `rows` (`[n][length]`) into at most `clusters` (1 to 256) of `terms` directions.
-pub fn cluster(rows: &[f32], length: usize, clusters: usize, terms: usize, seed: u64) -> Clusters {
+/// Clusters `rows` (`[n][length]`) into at most `clusters` (1 to 256) of `terms` directions, so that the least is left of
+/// rows times their `weights`, >= 0.
+pub fn cluster(rows: &[f32], length: usize, weights: &[f32], clusters: usize, terms: usize, seed: u64) -> Clusters {
     let n = rows.len().checked_div(length).unwrap_or(0);
     if n == 0 {
         return Clusters { terms, ..Clusters::default() };
     }
     let every = n.div_ceil(TRAINING);
     let training: Vec<f32> = rows.chunks_exact(length).step_by(every).flatten().copied().collect();
+    let important: Vec<f32> = weights.iter().step_by(every).copied().collect();
     let count = clusters.clamp(1, 256).min(training.len() / length);
-    let mut bases = Bases { length, terms: 0, values: seeds(&training, length, count, seed) };
+    let mut bases = Bases { length, terms: 0, values: seeds(&training, length, &important, count, seed) };
     let k_means = [0].repeat(ROUNDS[0]);
     let components = if terms > 0 { [terms].repeat(ROUNDS[1]) } else { Vec::new() };
     for terms in k_means.into_iter().chain(components) {
         let (ids, left) = bases.nearest(&training);
-        bases = Bases::fitted(&training, length, &ids, &left, count, terms);
+        let left: Vec<f32> = left.iter().zip(&important).map(|(left, weight)| left * weight * weight).collect();
+        bases = Bases::fitted(&training, length, &important, &ids, &left, [count, terms]);
     }
     let (ids, _) = bases.nearest(rows);
     let weights = bases.weights(rows, &ids);
     Clusters { terms, bases: bases.values, ids, weights }
 }
 
-/// k-means++ (Arthur and Vassilvitskii 2007): each seed is a row drawn by its squared distance from the seeds before.
-fn seeds(rows: &[f32], length: usize, count: usize, seed: u64) -> Vec<f32> {
+/// k-means++ (Arthur and Vassilvitskii 2007): each seed is a row drawn by its squared and weighted distance from the seeds
+/// before.
+fn seeds(rows: &[f32], length: usize, weights: &[f32], count: usize, seed: u64) -> Vec<f32> {
     let n = rows.len() / length;
     let mut random = Random::new(mix(seed));
     let mut chosen = (f64::from(random.unit()) * n as f64) as usize;
@@ -85,10 +89,12 @@ fn seeds(rows: &[f32], length: usize, count: usize, seed: u64) -> Vec<f32> {
     let mut out = Vec::with_capacity(count * length);
     for _ in 0..count {
         let centre = rows[chosen * length..][..length].to_vec();
-        distances.par_iter_mut().zip(rows.par_chunks_exact(length)).for_each(|(distance, row)| {
-            let square: f32 = row.iter().zip(&centre).map(|(a, b)| (a - b) * (a - b)).sum();
-            *distance = distance.min(f64::from(square));
-        });
+        distances.par_iter_mut().zip(rows.par_chunks_exact(length)).zip(weights).for_each(
+            |((distance, row), weight)| {
+                let square: f32 = row.iter().zip(&centre).map(|(a, b)| (a - b) * (a - b)).sum();
+                *distance = distance.min(f64::from(square) * f64::from(*weight).powi(2));
+            },
+        );
         out.extend(centre);
         let mut rest = f64::from(random.unit()) * distances.iter().sum::<f64>();
         chosen = n - 1;
@@ -111,8 +117,15 @@ struct Bases {
 }
 
 impl Bases {
-    /// The mean and the directions of each cluster; what `left` of a row says how badly off it is.
-    fn fitted(rows: &[f32], length: usize, ids: &[u8], left: &[f32], count: usize, terms: usize) -> Self {
+    /// The weighted mean and the directions of each cluster; what `left` of a row says how badly off it is.
+    fn fitted(
+        rows: &[f32],
+        length: usize,
+        weights: &[f32],
+        ids: &[u8],
+        left: &[f32],
+        [count, terms]: [usize; 2],
+    ) -> Self {
         let mut members: Vec<Vec<usize>> = vec![Vec::new(); count];
         ids.iter().enumerate().for_each(|(row, &id)| members[usize::from(id)].push(row));
         // Rows that are worst off, for clusters without any.
@@ -126,16 +139,21 @@ impl Bases {
             members.extend(next.next());
         }
         let fit = |members: &Vec<usize>| {
-            let mut mean = vec![0.0f64; length];
+            let (mut mean, mut whole) = (vec![0.0f64; length], 0.0);
             for &row in members {
-                mean.iter_mut().zip(&rows[row * length..][..length]).for_each(|(m, v)| *m += f64::from(*v));
+                let share = f64::from(weights[row]).powi(2);
+                whole += share;
+                mean.iter_mut().zip(&rows[row * length..][..length]).for_each(|(m, v)| *m += share * f64::from(*v));
             }
-            let mean: Vec<f32> = mean.iter().map(|m| (m / members.len().max(1) as f64) as f32).collect();
+            let mean: Vec<f32> = mean.iter().map(|m| (m / whole) as f32).collect();
             let mut out = mean.clone();
             if terms > 0 {
                 let centred: Vec<f32> = members
                     .iter()
-                    .flat_map(|&row| rows[row * length..][..length].iter().zip(&mean).map(|(v, m)| v - m))
+                    .flat_map(|&row| {
+                        let weight = weights[row];
+                        rows[row * length..][..length].iter().zip(&mean).map(move |(v, m)| (v - m) * weight)
+                    })
                     .collect();
                 let (values, vectors) = eigenvectors(&gram(&centred, length), length);
                 let least = values[0] * 1e-10;
@@ -247,7 +265,7 @@ mod tests {
     #[test]
     fn rows_of_three_planes_are_found_by_three_clusters_of_two_terms() {
         let rows = planes(600, 20);
-        let found = cluster(&rows, 20, 3, 2, 1);
+        let found = cluster(&rows, 20, &[1.0; 600], 3, 2, 1);
         // f32 throughout, numbers up to 6.
         assert!(error(&rows, 20, &found) < 1e-5, "{}", error(&rows, 20, &found));
         assert!((0..600).all(|i| found.ids[i] == found.ids[i % 3]));
@@ -257,7 +275,7 @@ mod tests {
     fn more_clusters_and_more_terms_leave_less() {
         let rows: Vec<f32> = planes(900, 16).iter().enumerate().map(|(i, v)| v + (i as f32 * 0.37).sin()).collect();
         let errors: Vec<f64> = [(1, 0), (4, 0), (4, 2), (16, 2), (16, 4)]
-            .map(|(clusters, terms)| error(&rows, 16, &cluster(&rows, 16, clusters, terms, 1)))
+            .map(|(clusters, terms)| error(&rows, 16, &cluster(&rows, 16, &[1.0; 900], clusters, terms, 1)))
             .to_vec();
         assert!(errors.windows(2).all(|e| e[1] < e[0]), "{errors:?}");
     }
@@ -265,13 +283,13 @@ mod tests {
     #[test]
     fn rows_fewer_than_clusters_equal_rows_and_no_rows_are_no_trouble() {
         let few = planes(3, 8);
-        let found = cluster(&few, 8, 128, 4, 1);
+        let found = cluster(&few, 8, &[1.0; 3], 128, 4, 1);
         assert!(error(&few, 8, &found) < 1e-6 && found.bases.len() == 3 * 5 * 8);
         let equal = [1.0f32, 2.0, 3.0, 4.0].repeat(50);
-        let found = cluster(&equal, 4, 8, 2, 1);
+        let found = cluster(&equal, 4, &[1.0; 50], 8, 2, 1);
         assert!(error(&equal, 4, &found) < 1e-7 && found.bases.iter().chain(&found.weights).all(|v| v.is_finite()));
-        assert_eq!(cluster(&[], 4, 8, 2, 1), Clusters { terms: 2, ..Clusters::default() });
-        assert!(cluster(&[0.0; 40], 4, 8, 2, 1).weights.iter().all(|w| *w == 0.0));
+        assert_eq!(cluster(&[], 4, &[], 8, 2, 1), Clusters { terms: 2, ..Clusters::default() });
+        assert!(cluster(&[0.0; 40], 4, &[1.0; 10], 8, 2, 1).weights.iter().all(|w| *w == 0.0));
     }
 
     #[test]
@@ -279,7 +297,7 @@ mod tests {
         let rows = planes(500, 12);
         let with = |threads| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| cluster(&rows, 12, 8, 3, 7))
+            pool.install(|| cluster(&rows, 12, &[1.0; 500], 8, 3, 7))
         };
         assert_eq!(with(1), with(3));
     }

@@ -31,7 +31,9 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 /// Collisions after which a path is cut; the energy that is left is told.
 const LONGEST: u32 = 20_000;
-/// Weight below which half of the photons end and the others count twice.
+/// Paths of a photon, each from a first collision of its own: to measure a column takes longer than to follow a path.
+const PATHS: u32 = 3;
+/// Share of a path's first weight below which half of the paths end and the others count twice.
 const FAINT: f32 = 0.1;
 /// Bytes of moments of triangles that wait to be added up.
 const WAITING_BYTES: usize = 256 << 20;
@@ -61,9 +63,6 @@ pub struct PhotonSettings {
     /// Lowest order that is deposited: 1, as light that was not scattered is kept apart; 0 for all of it.
     pub lowest_order: u32,
 }
-
-/// The row that a flight adds, of the photon's first direction (to the light) and the harmonics of the flight's.
-type Spread<'a> = dyn FnMut(DVec3, &[f32], &mut [f32]) + 'a;
 
 /// What came of the photons.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -275,58 +274,69 @@ impl<'a> Photons<'a> {
             let start = self.place_on_box(toward, shadow, strata.pair(1));
             // A flat triangle is drawn from: solid angle over area goes with the jacobian, whose mean is 1 by design.
             let power = (shadow * solid_angle * jacobian / f64::from(count)) as f32;
-            let mut way = -toward.as_vec3();
-            let mut ray = self.space.ray(start, way);
-            let add = |ray: &Ray,
-                       way: Vec3,
-                       weight: f32,
-                       flight: &mut [f32],
-                       sums: &mut [f32],
-                       random: &mut Random,
-                       spread: &mut Spread| {
+            let way = -toward.as_vec3();
+            let ray = self.space.ray(start, way);
+            let mut fly = |ray: &Ray, way: Vec3, weight: f32, random: &mut Random| {
                 let harmonics = evaluate(self.settings.bands, -way);
-                spread(toward, &harmonics[..n], flight);
-                self.fly(ray, power * weight, flight, sums, random)
+                spread(toward, &harmonics[..n], &mut flight);
+                self.fly(ray, power * weight, &flight, sums, random)
             };
-            let (mut place, mut weight);
             if self.settings.lowest_order == 0 {
-                weight = 1.0;
-                match add(&ray, way, weight, &mut flight, sums, &mut random, &mut spread) {
-                    Some(hit) => place = ray.at(hit),
-                    None => continue,
+                if let Some(hit) = fly(&ray, way, 1.0, &mut random) {
+                    let after = [random.unit(), random.unit()];
+                    self.follow(ray.at(hit), way, 1.0, after, &mut random, cut, &mut fly);
                 }
-            } else {
-                column.measure(&self.space, &ray);
-                let opacity = -(-f64::from(self.medium.sigma_t) * column.total).exp_m1();
-                if opacity <= 0.0 {
-                    continue;
-                }
-                weight = opacity as f32;
-                let [u, _] = strata.pair(2);
-                let depth = -(-f64::from(u) * opacity).ln_1p() / f64::from(self.medium.sigma_t);
-                place = ray.at(column.place(&self.space, &ray, depth.min(column.total)));
+                continue;
             }
-            let mut order = 0;
-            loop {
-                weight *= self.medium.albedo;
-                if weight < FAINT {
-                    if random.unit() < 0.5 {
-                        break;
-                    }
-                    weight *= 2.0;
-                }
-                if order == LONGEST {
-                    cut.fetch_add((f64::from(weight) * 1e6) as u64, Ordering::Relaxed);
+            column.measure(&self.space, &ray);
+            let opacity = -(-f64::from(self.medium.sigma_t) * column.total).exp_m1();
+            if opacity <= 0.0 {
+                continue;
+            }
+            let weight = opacity as f32 / PATHS as f32;
+            let [u, _] = strata.pair(2);
+            for path in 0..PATHS {
+                let u = (f64::from(path) + f64::from(u)) / f64::from(PATHS);
+                let depth = -(-u * opacity).ln_1p() / f64::from(self.medium.sigma_t);
+                let place = ray.at(column.place(&self.space, &ray, depth.min(column.total)));
+                self.follow(place, way, weight, strata.pair(3 + path), &mut random, cut, &mut fly);
+            }
+        }
+    }
+
+    /// A path of a `weight` from its first collision on, where it comes along `way`; `after` decides where it goes on, and
+    /// `fly(ray, way, weight, random)` flies to the next collision.
+    #[expect(clippy::too_many_arguments, reason = "a path's state, and what it is followed with")]
+    #[inline(always)]
+    fn follow(
+        &self,
+        mut place: DVec3,
+        mut way: Vec3,
+        whole: f32,
+        after: [f32; 2],
+        random: &mut Random,
+        cut: &AtomicU64,
+        fly: &mut impl FnMut(&Ray, Vec3, f32, &mut Random) -> Option<f64>,
+    ) {
+        let mut weight = whole;
+        for order in 0.. {
+            weight *= self.medium.albedo;
+            if weight < FAINT * whole {
+                if random.unit() < 0.5 {
                     break;
                 }
-                let u = if order == 0 { strata.pair(3) } else { [random.unit(), random.unit()] };
-                way = phase::sample(self.medium.g, way, u).0;
-                ray = self.space.ray(place, way);
-                order += 1;
-                match add(&ray, way, weight, &mut flight, sums, &mut random, &mut spread) {
-                    Some(hit) => place = ray.at(hit),
-                    None => break,
-                }
+                weight *= 2.0;
+            }
+            if order == LONGEST {
+                cut.fetch_add((f64::from(weight) * 1e6) as u64, Ordering::Relaxed);
+                break;
+            }
+            let u = if order == 0 { after } else { [random.unit(), random.unit()] };
+            way = phase::sample(self.medium.g, way, u).0;
+            let ray = self.space.ray(place, way);
+            match fly(&ray, way, weight, random) {
+                Some(hit) => place = ray.at(hit),
+                None => break,
             }
         }
     }

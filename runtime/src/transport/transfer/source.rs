@@ -128,7 +128,7 @@ impl TransferTransport {
             .collect();
         let suns = suns.into_iter().filter_map(|sun| self.sweep(field, sun)).collect();
         let indirect: &[Light] = if scattering == ScatteringOrder::Single { &[] } else { lights };
-        let moments = moments(&transfer, &self.cells, &transfer.indirect_basis.coefficients(indirect));
+        let moments = moments(&transfer, &self.cells, &transfer.indirect_basis.response_coefficients(indirect));
         let mut source = TransferSource {
             nodes: self.nodes.clone(),
             cells: self.cells.clone(),
