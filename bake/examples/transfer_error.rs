@@ -15,6 +15,7 @@ use smoke_runtime::camera::Camera;
 use smoke_runtime::light::{Environment, Light};
 use smoke_runtime::march::{MarchMedium, MarchSettings, march};
 use smoke_runtime::medium::field::DensityField;
+use smoke_runtime::shaded_volume::ShadedVolume;
 use smoke_runtime::sphere::light_basis::{BasisKind, LightBasis};
 use smoke_runtime::transport::medium::MediumParameters;
 use smoke_runtime::transport::reference::{Estimate, ReferenceSettings, trace};
@@ -199,7 +200,8 @@ fn error(field: &DensityField, camera: &Camera, case: &Case, transfer: &Arc<Fram
     let source = transport.light(field, &case.lights, ScatteringOrder::All);
     let lit = start.elapsed().as_secs_f64();
     let start = Instant::now();
-    let shaded = source.shade(field, camera.position);
+    let mut shaded = ShadedVolume::of(field);
+    source.shade(field, camera.position, &mut shaded);
     let viewed = start.elapsed().as_secs_f64();
     eprintln!("{} g {}: light {:.1} ms, view {:.1} ms", case.name, case.g, 1e3 * lit, 1e3 * viewed);
     let sky = Sky::new(&case.lights, None);

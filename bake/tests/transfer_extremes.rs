@@ -8,6 +8,7 @@ use smoke_runtime::film::Film;
 use smoke_runtime::light::{Environment, Light};
 use smoke_runtime::march::{Black, MarchMedium, MarchSettings, march};
 use smoke_runtime::medium::field::DensityField;
+use smoke_runtime::shaded_volume::ShadedVolume;
 use smoke_runtime::sphere::light_basis::{BasisKind, LightBasis};
 use smoke_runtime::transport::medium::MediumParameters;
 use smoke_runtime::transport::transfer::frame::{Clustered, FrameTransfer};
@@ -55,7 +56,8 @@ fn image(field: &DensityField, basis: BasisKind, medium: MediumParameters, light
     let source = transport.light(field, lights, ScatteringOrder::All);
     let centre = DVec3::splat(0.5 * size);
     let camera = Camera::look_at(centre - DVec3::new(0.0, 2.0 * size, 0.0), centre, DVec3::Z, 40.0, 12, 12);
-    let shaded = source.shade(field, camera.position);
+    let mut shaded = ShadedVolume::of(field);
+    source.shade(field, camera.position, &mut shaded);
     march(&shaded, &camera, &MarchMedium::plain(medium.sigma_t), &Black, &MarchSettings::default())
 }
 

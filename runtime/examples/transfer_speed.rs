@@ -10,6 +10,7 @@
 use glam::{DAffine3, DVec3, Vec3};
 use smoke_runtime::light::{Environment, Light};
 use smoke_runtime::medium::field::DensityField;
+use smoke_runtime::shaded_volume::ShadedVolume;
 use smoke_runtime::sphere::light_basis::{BasisKind, LightBasis};
 use smoke_runtime::transport::medium::MediumParameters;
 use smoke_runtime::transport::transfer::cells::Cells;
@@ -32,6 +33,7 @@ fn main() {
     for g in [0.0f32, 0.5] {
         let transfer = Arc::new(transfer(&field, g));
         let settings = TransferSettings::default();
+        let mut volume = ShadedVolume::of(&field);
         let mut transport = TransferTransport::new(&field, transfer, settings).expect("made for this field");
         for (name, light) in [("sky of 1024 x 512", sky()), ("sun", sun())] {
             let lights = [light];
@@ -42,9 +44,8 @@ fn main() {
                 lit = lit.min(start.elapsed().as_secs_f64());
                 let eye = DVec3::new(0.5, -1.5 - 0.01 * f64::from(run), 0.6);
                 let start = Instant::now();
-                let shaded = source.shade(&field, eye);
+                source.shade(&field, eye, &mut volume);
                 viewed = viewed.min(start.elapsed().as_secs_f64());
-                drop(shaded);
             }
             println!("| {g} | {name} | {:.1} ms | {:.1} ms |", 1e3 * lit, 1e3 * viewed);
         }

@@ -14,6 +14,7 @@ pub mod medium;
 pub mod plan;
 pub mod product;
 pub mod renderer;
+pub mod shaded_volume;
 pub mod sphere;
 pub mod statistics;
 pub mod tracking;

@@ -5,24 +5,18 @@
 //! back to front, where this stops as soon as nothing behind can be seen. Samples lie at fixed distances from the eye:
 //! the paper's half a voxel apart on request, by default a voxel, or less where that would be more than
 //! [`DEPTH_PER_SAMPLE`] of optical depth (measured on the plume: `docs/decisions/030-march-step.md`); bricks without density are stepped over, which changes no sample.
-//! Each brick holds copies of the nodes at its far faces, so that a fetch stays inside 2000 bytes with fixed strides; the
-//! samples of a brick are placed and their exponentials taken by lanes, and added up one after the other.
+//! A fetch stays inside one brick of [`ShadedVolume`], 2000 bytes with fixed strides; the samples of a brick are placed and their exponentials taken by lanes, and added up one after the other.
 //! Cost: O(pixels x samples in dense bricks), each one trilinear fetch of four channels at once.
 
 use crate::camera::Camera;
 use crate::film::{Film, Pixel};
 use crate::half_resolution;
 use crate::lanes::exp_neg_and_rest;
+use crate::shaded_volume::{BRICK, BRICK_NODES, EMPTY, SIDE, ShadedVolume};
 use glam::{DAffine3, DVec3, Vec4};
 use multiversion::multiversion;
 use rayon::prelude::*;
 
-/// Cells along a side of a brick.
-const BRICK: usize = 4;
-/// Nodes along a side of a brick: those of its far faces belong to its neighbours as well.
-const SIDE: usize = BRICK + 1;
-/// Nodes of a brick.
-const BRICK_NODES: usize = SIDE * SIDE * SIDE;
 /// Node of the last cell of a brick.
 const LAST_CELL: usize = (BRICK - 1) * (1 + SIDE + SIDE * SIDE);
 /// Samples that are placed and exponentiated together.
@@ -31,22 +25,6 @@ const LANES: usize = 16;
 const DEPTH_PER_SAMPLE: f64 = 0.3;
 /// Smallest step that is chosen, in voxels: below it the density is known no better than linearly.
 const LEAST_STEP: f64 = 0.25;
-/// Marks a brick without density.
-const EMPTY: u32 = u32::MAX;
-
-/// Source radiance and density of one frame, ready to be marched: what the volume pass writes.
-pub struct ShadedVolume {
-    /// Nodes along x, y, z, as in the [`crate::medium::field::DensityField`] it was made from.
-    dims: [usize; 3],
-    /// `[J red, J green, J blue, D]` of the nodes of each brick with density, x fastest.
-    nodes: Vec<[[f32; 4]; BRICK_NODES]>,
-    /// Where in `nodes` a brick is, or [`EMPTY`]; x fastest.
-    places: Vec<u32>,
-    bricks: [usize; 3],
-    world_from_node: DAffine3,
-    density_max: f32,
-}
-
 /// The dials of the march.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MarchSettings {
@@ -68,37 +46,6 @@ impl Default for MarchSettings {
 }
 
 impl ShadedVolume {
-    /// A volume of `nodes` (`[J red, J green, J blue, D]`, x fastest, border included).
-    pub fn new(dims: [usize; 3], nodes: &[[f32; 4]], world_from_node: DAffine3) -> Self {
-        assert_eq!(nodes.len(), dims.iter().product::<usize>(), "one value a node");
-        let bricks = dims.map(|n| (n - 1).div_ceil(BRICK));
-        let count = bricks.iter().product();
-        let corners = |b: usize| {
-            let first = [b % bricks[0], b / bricks[0] % bricks[1], b / bricks[0] / bricks[1]].map(|b| b * BRICK);
-            (first, [0, 1, 2].map(|a| (first[a] + SIDE).min(dims[a])))
-        };
-        let rows = |(first, end): ([usize; 3], [usize; 3])| {
-            let lines = (first[2]..end[2]).flat_map(move |k| (first[1]..end[1]).map(move |j| (j, k)));
-            lines.map(move |(j, k)| {
-                let start = dims[0] * (j + dims[1] * k);
-                let place = SIDE * (j - first[1] + SIDE * (k - first[2]));
-                (place, &nodes[start + first[0]..start + end[0]])
-            })
-        };
-        let is_dense = |b: &usize| rows(corners(*b)).any(|(_, row)| row.iter().any(|n| n[3] > 0.0));
-        let dense: Vec<usize> = (0..count).into_par_iter().filter(is_dense).collect();
-        let copy = |b: &usize| {
-            let mut brick = [[0.0; 4]; BRICK_NODES];
-            rows(corners(*b)).for_each(|(place, row)| brick[place..][..row.len()].copy_from_slice(row));
-            brick
-        };
-        let out: Vec<_> = dense.par_iter().map(copy).collect();
-        let mut places = vec![EMPTY; count];
-        dense.iter().enumerate().for_each(|(place, &b)| places[b] = place as u32);
-        let density_max = nodes.par_iter().map(|n| n[3]).reduce(|| 0.0, f32::max);
-        Self { dims, nodes: out, places, bricks, world_from_node, density_max }
-    }
-
     /// World length between samples.
     fn sample_distance(&self, step: f32, sigma_t: [f32; 3]) -> f64 {
         let sides = [0, 1, 2].map(|a| self.world_from_node.matrix3.col(a).length());
@@ -468,7 +415,7 @@ mod tests {
             let k = v / 144;
             [source, source, source, if (1..=8).contains(&k) { density } else { 0.0 }]
         });
-        let volume = ShadedVolume::new(dims, &nodes.collect::<Vec<_>>(), DAffine3::IDENTITY);
+        let volume = ShadedVolume::of_nodes(dims, &nodes.collect::<Vec<_>>());
         let camera = Camera::look_at(DVec3::new(5.5, 5.5, 60.0), DVec3::new(5.5, 5.5, 0.0), DVec3::Y, 2.0, 3, 3);
         (volume, camera)
     }

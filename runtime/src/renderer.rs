@@ -9,8 +9,9 @@ use crate::backdrop::Sky;
 use crate::camera::Camera;
 use crate::film::Film;
 use crate::light::{Beam, Light, beams};
-use crate::march::{MarchMedium, MarchSettings, ShadedVolume, march};
+use crate::march::{MarchMedium, MarchSettings, march};
 use crate::medium::frame::Frame;
+use crate::shaded_volume::ShadedVolume;
 use crate::transport::compensated::centres::incident::incident;
 use crate::transport::compensated::centres::route::{CentreError, CentreSettings, CentreTransport, MultipleScattering};
 use crate::transport::compensated::centres::source::{CentreSource, UnitPlacement};
@@ -141,6 +142,7 @@ pub struct Seconds {
 struct Loaded {
     frame: Frame,
     transport: Transport,
+    volume: ShadedVolume,
 }
 
 enum Transport {
@@ -159,7 +161,8 @@ pub struct Renderer {
     sky: Option<Sky>,
     loaded: Option<Loaded>,
     source: Option<(Box<dyn SourceRadiance>, MarchMedium)>,
-    shaded: Option<(ShadedVolume, DVec3)>,
+    /// The eye that the frame's volume is shaded for.
+    shaded: Option<DVec3>,
 }
 
 impl Renderer {
@@ -199,7 +202,8 @@ impl Renderer {
                 Transport::Transfer(Box::new(TransferTransport::new(&frame.field, transfer, settings)?))
             }
         };
-        self.loaded = Some(Loaded { frame, transport });
+        let volume = ShadedVolume::of(&frame.field);
+        self.loaded = Some(Loaded { frame, transport, volume });
         Ok(())
     }
 
@@ -237,16 +241,15 @@ impl Renderer {
         seconds.source_radiance = start.elapsed().as_secs_f64();
         let start = Instant::now();
         let still_good = |eye: DVec3| eye == camera.position || !source.depends_on_view();
-        let shaded = match self.shaded.take() {
-            Some((volume, eye)) if still_good(eye) => (volume, eye),
-            _ => (source.shade(&loaded.frame.field, camera.position), camera.position),
-        };
-        let shaded = &self.shaded.insert(shaded).0;
+        if !self.shaded.is_some_and(still_good) {
+            source.shade(&loaded.frame.field, camera.position, &mut loaded.volume);
+            self.shaded = Some(camera.position);
+        }
         seconds.volume_pass = start.elapsed().as_secs_f64();
         let start = Instant::now();
         let peak = (medium.peak_ratio != [1.0; 3]).then_some((self.medium.g, self.settings.sh_order));
         let sky = self.sky.get_or_insert_with(|| Sky::new(&self.lights, peak));
-        let film = march(shaded, camera, medium, sky, &self.settings.march);
+        let film = march(&loaded.volume, camera, medium, sky, &self.settings.march);
         seconds.view_pass = start.elapsed().as_secs_f64();
         Ok((film, seconds))
     }
@@ -259,7 +262,7 @@ fn solve(
     lights: &[Light],
     beams: &[Beam],
 ) -> Result<(Box<dyn SourceRadiance>, MarchMedium), RenderError> {
-    let Loaded { frame, transport } = loaded;
+    let Loaded { frame, transport, .. } = loaded;
     Ok(match transport {
         Transport::Grid(transport) => {
             let banded = match settings.scattering {

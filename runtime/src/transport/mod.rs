@@ -5,8 +5,8 @@ pub mod medium;
 pub mod reference;
 pub mod transfer;
 
-use crate::march::ShadedVolume;
 use crate::medium::field::DensityField;
+use crate::shaded_volume::ShadedVolume;
 use glam::DVec3;
 
 /// Which orders of scattering are computed.
@@ -25,6 +25,6 @@ pub trait SourceRadiance: Send + Sync {
     /// True if the shaded volume must be made again when the camera moves.
     fn depends_on_view(&self) -> bool;
 
-    /// The volume pass: source radiance towards `eye` (world space), with the density, on the field's nodes.
-    fn shade(&self, field: &DensityField, eye: DVec3) -> ShadedVolume;
+    /// The volume pass: source radiance towards `eye` (world space), into the volume of the same field.
+    fn shade(&self, field: &DensityField, eye: DVec3, volume: &mut ShadedVolume);
 }

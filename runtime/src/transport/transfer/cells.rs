@@ -21,6 +21,8 @@ pub struct Cells {
     pub shift: u32,
     /// For each cell of the box, its place among those with density, or [`EMPTY`].
     pub places: Vec<u32>,
+    /// The place in the box of each cell with density, x fastest.
+    pub bricks: Vec<u32>,
     /// Integral of the density over each cell with density, world units; > 0.
     pub mass: Vec<f64>,
 }
@@ -56,9 +58,9 @@ impl Cells {
             // A density too small to be summed still makes a cell; nothing is divided by zero.
             (sum * 0.125 * voxel).max(f64::MIN_POSITIVE)
         };
-        let active: Vec<usize> = (0..places.len()).filter(|&b| places[b] != EMPTY).collect();
-        let mass = active.into_par_iter().map(mass).collect();
-        Self { majorants, shift, places, mass }
+        let bricks: Vec<u32> = (0..places.len() as u32).filter(|&b| places[b as usize] != EMPTY).collect();
+        let mass = bricks.par_iter().map(|&brick| mass(brick as usize)).collect();
+        Self { majorants, shift, places, bricks, mass }
     }
 
     /// The number of cells with density.
@@ -80,18 +82,21 @@ impl Cells {
     }
 
     /// Sums of `values`, one a cell with density whose last component is 1, over the four cells around the line of nodes
-    /// at `[j, k]`, for each cell along x, one before and one after the box included.
-    pub fn line(&self, node: [usize; 2], values: &[Vec4]) -> Vec<Vec4> {
+    /// at `[j, k]`, for each cell along x, one before and one after the box included; those that nodes `from` to `to` are
+    /// not between are left at zero.
+    pub fn line(&self, node: [usize; 2], [from, to]: [usize; 2], values: &[Vec4]) -> Vec<Vec4> {
         let [bx, by, bz] = self.majorants.bricks;
         let mut out = vec![Vec4::ZERO; bx + 2];
         let ((y, f), (z, g)) = (self.next_to(node[0]), self.next_to(node[1]));
+        let first = self.next_to(from).0.max(0) as usize;
+        let end = ((self.next_to(to).0 + 2) as usize).min(bx);
         for (b, c, weight) in
             [(0, 0, (1.0 - f) * (1.0 - g)), (1, 0, f * (1.0 - g)), (0, 1, (1.0 - f) * g), (1, 1, f * g)]
         {
             let (y, z) = (y + b, z + c);
             if weight > 0.0 && (0..by as isize).contains(&y) && (0..bz as isize).contains(&z) {
-                let places = &self.places[bx * (y as usize + by * z as usize)..][..bx];
-                for (out, &place) in out[1..].iter_mut().zip(places).filter(|(_, p)| **p != EMPTY) {
+                let places = &self.places[bx * (y as usize + by * z as usize)..][first..end];
+                for (out, &place) in out[1 + first..].iter_mut().zip(places).filter(|(_, p)| **p != EMPTY) {
                     *out += values[place as usize] * weight;
                 }
             }
@@ -141,7 +146,7 @@ mod tests {
             values[place as usize] = Vec4::new(middle[0] + 10.0 * middle[1] + 100.0 * middle[2], 3.0, 0.0, 1.0);
         }
         for [i, j, k] in [[1, 1, 1], [7, 8, 9], [2, 2, 2], [16, 16, 16], [10, 3, 5], [0, 17, 3]] {
-            let found = cells.between(i, &cells.line([j, k], &values));
+            let found = cells.between(i, &cells.line([j, k], [0, 16], &values));
             assert!((found.y - 3.0).abs() < 1e-5, "{found}");
             if [i, j, k].iter().all(|n| (2..=14).contains(n)) {
                 let expected = i as f32 + 10.0 * j as f32 + 100.0 * k as f32;
@@ -150,6 +155,6 @@ mod tests {
         }
         let empty = DensityField::from_box([0; 3], [4; 3], &[0.0; 64], DAffine3::IDENTITY);
         let cells = Cells::new(&empty, 1);
-        assert_eq!(cells.between(2, &cells.line([2, 2], &[])), Vec4::ZERO);
+        assert_eq!(cells.between(2, &cells.line([2, 2], [0, 4], &[])), Vec4::ZERO);
     }
 }

@@ -16,9 +16,9 @@ use super::frame::{Clustered, FrameTransfer};
 use super::lit_nodes::lit_nodes;
 use super::view_directions::{Between, ViewDirections, squares};
 use crate::light::Light;
-use crate::march::ShadedVolume;
 use crate::medium::field::DensityField;
 use crate::product::add_product;
+use crate::shaded_volume::ShadedVolume;
 use crate::sphere::harmonics::evaluate;
 use crate::sphere::light_basis::BasisKind;
 use crate::tracking::phase;
@@ -26,7 +26,9 @@ use crate::transport::compensated::grid::columns::SweepGrid;
 use crate::transport::compensated::grid::single::transmittance_from;
 use crate::transport::{ScatteringOrder, SourceRadiance};
 use glam::{DVec3, Vec3, Vec4};
+use multiversion::multiversion;
 use rayon::prelude::*;
+use std::ops::Range;
 use std::sync::Arc;
 
 /// The dials of the method.
@@ -58,6 +60,7 @@ pub struct TransferError {
 pub struct TransferTransport {
     transfer: Arc<FrameTransfer>,
     nodes: Arc<Vec<u32>>,
+    lines: Arc<Vec<u32>>,
     cells: Arc<Cells>,
     settings: TransferSettings,
     /// For sweeps of suns; made for the first.
@@ -71,10 +74,20 @@ struct Sun {
     transmittance: [Arc<Vec<f32>>; 3],
 }
 
+/// Radiance of the clusters of one set of direct rows.
+struct LitClusters {
+    /// `[view][cluster][1 + terms]`, RGB and a zero.
+    radiance: Vec<Vec4>,
+    /// Numbers of a view.
+    each_view: usize,
+}
+
 /// A lit frame.
 pub struct TransferSource {
     transfer: Arc<FrameTransfer>,
     nodes: Arc<Vec<u32>>,
+    /// Place in `nodes` of the first node of each line along x, and the end of the last.
+    lines: Arc<Vec<u32>>,
     cells: Arc<Cells>,
     /// Irradiance from each direction of the mesh.
     irradiance: Vec<[f32; 3]>,
@@ -82,7 +95,7 @@ pub struct TransferSource {
     /// `[cell][lm]`, RGB and a zero.
     moments: Vec<Vec4>,
     /// Direct radiance of each set's clusters where it is the same from everywhere.
-    even: Option<Vec<Vec<Vec4>>>,
+    even: Option<Vec<LitClusters>>,
 }
 
 impl TransferTransport {
@@ -107,7 +120,17 @@ impl TransferTransport {
         let lights = transfer.indirect_basis.kind().len();
         check("direct light", &transfer.direct, nodes.len(), transfer.basis.areas().len())?;
         check("indirect light", &transfer.indirect, cells.len(), lights * transfer.bands * transfer.bands)?;
-        Ok(Self { transfer, nodes: Arc::new(nodes), cells: Arc::new(cells), settings, grid: None })
+        let [nx, ny, nz] = field.dims;
+        let before = |line: usize| nodes.partition_point(|&node| (node as usize) < line * nx) as u32;
+        let lines = (0..=ny * nz).into_par_iter().map(before).collect::<Vec<_>>();
+        Ok(Self {
+            transfer,
+            nodes: Arc::new(nodes),
+            lines: Arc::new(lines),
+            cells: Arc::new(cells),
+            settings,
+            grid: None,
+        })
     }
 
     /// Lights the frame `field`, the same as at [`Self::new`]; points count for nothing.
@@ -131,6 +154,7 @@ impl TransferTransport {
         let moments = moments(&transfer, &self.cells, &transfer.indirect_basis.response_coefficients(indirect));
         let mut source = TransferSource {
             nodes: self.nodes.clone(),
+            lines: self.lines.clone(),
             cells: self.cells.clone(),
             transfer,
             irradiance,
@@ -159,6 +183,15 @@ impl TransferTransport {
         let of = |sigma_t: f32| found.iter().find(|(sigma, _)| *sigma == sigma_t).map(|(_, t)| t.clone());
         let transmittance = [0, 1, 2].map(|c| of(medium.sigma_t[c]).unwrap_or_default());
         Some(Sun { toward, power: [0, 1, 2].map(|c| irradiance[c] * medium.albedo[c]), transmittance })
+    }
+}
+
+/// The radiance of `moments` (`[cell][bands^2]`) along a way for each cell; its last component is 1, see [`Cells::line`].
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn along_ways(out: &mut [Vec4], moments: &[Vec4], ways: &[Vec3], bands: usize) {
+    for ((out, moments), way) in out.iter_mut().zip(moments.chunks_exact(bands * bands)).zip(ways) {
+        let harmonics = evaluate(bands, *way);
+        *out = moments.iter().zip(harmonics).fold(Vec4::ZERO, |sum, (m, y)| sum + *m * y).with_w(1.0);
     }
 }
 
@@ -201,8 +234,8 @@ fn moments(transfer: &FrameTransfer, cells: &Cells, coefficients: &[[f64; 3]]) -
 
 impl TransferSource {
     /// Radiance that each direct cluster and each of its directions sends the way that is seen along each of `views`,
-    /// unit vectors from the eye: for each set `[view][cluster][1 + terms]`.
-    fn lit_clusters(&self, views: &[DVec3]) -> Vec<Vec<Vec4>> {
+    /// unit vectors from the eye, for each set.
+    fn lit_clusters(&self, views: &[DVec3]) -> Vec<LitClusters> {
         let transfer = &self.transfer;
         let (mesh, medium) = (transfer.basis.mesh(), &transfer.medium);
         let of_set = |(s, set): (usize, &Clustered)| {
@@ -227,7 +260,8 @@ impl TransferSource {
                 channels.iter().zip(from).for_each(|(&c, v)| out[c] = *v);
                 out
             };
-            (0..views.len() * rows).into_par_iter().map(|i| at(i / rows, i % rows)).collect()
+            let radiance = (0..views.len() * rows).into_par_iter().map(|i| at(i / rows, i % rows)).collect();
+            LitClusters { radiance, each_view: rows }
         };
         transfer.direct.iter().enumerate().map(of_set).collect()
     }
@@ -238,92 +272,135 @@ impl SourceRadiance for TransferSource {
         self.transfer.medium.g != 0.0
     }
 
-    fn shade(&self, field: &DensityField, eye: DVec3) -> ShadedVolume {
-        let transfer = &self.transfer;
-        let [nx, ny, _] = field.dims;
+    fn shade(&self, field: &DensityField, eye: DVec3, volume: &mut ShadedVolume) {
         let node_eye = field.world_from_node.inverse().transform_point3(eye);
         let linear = field.world_from_node.matrix3;
-        let place = |node: u32| [node as usize % nx, node as usize / nx % ny, node as usize / nx / ny];
-        let along = |at: [usize; 3]| linear * (DVec3::from_array(at.map(|v| v as f64)) - node_eye);
-        let (view, lit) = match &self.even {
-            Some(lit) => (None, lit),
-            None => {
-                let squares = squares(transfer.medium.g);
-                let between = |&node: &u32| Between::of(along(place(node)), squares);
-                let seen: Vec<Between> = self.nodes.par_iter().map(between).collect();
-                let view = ViewDirections::of(seen.iter().copied(), squares);
-                let lit = self.lit_clusters(view.directions());
-                (Some((view, seen)), &{ lit })
-            }
+        let along = |[i, j, k]: [usize; 3]| (linear * (DVec3::new(i as f64, j as f64, k as f64) - node_eye)).as_vec3();
+        let across = linear.x_axis.as_vec3();
+        let squares = squares(self.transfer.medium.g);
+        // Where only suns shine, there is no direct light of clusters.
+        let seen = (self.even.is_none() && self.irradiance.iter().any(|e| *e != [0.0; 3])).then(|| {
+            let (corners, side) = volume.corners();
+            let corners: Vec<Vec3> = corners.map(along).collect();
+            let edges = [linear.x_axis, linear.y_axis, linear.z_axis].map(|edge| edge.as_vec3());
+            let directions = ViewDirections::of_boxes(&corners, edges, side, squares);
+            let lit = self.lit_clusters(directions.directions());
+            (directions, lit)
+        });
+        let direct = match (&self.even, &seen) {
+            (Some(lit), _) => Direct::Even(lit),
+            (None, Some((directions, lit))) => Direct::Seen(directions, squares, lit),
+            (None, None) => Direct::None,
         };
         let cells = self.seen_cells(field, eye);
-        let mut shaded: Vec<[f32; 4]> = Vec::new();
-        shaded.par_extend(rayon::iter::repeat_n([0.0; 4], field.values.len()));
-        // Slices along z: nodes are in order, so each has a range of them.
-        shaded.par_chunks_mut(nx * ny).enumerate().for_each(|(k, out)| {
-            let [start, end] = [k, k + 1].map(|k| self.nodes.partition_point(|&n| (n as usize) < nx * ny * k));
-            let mut line = (usize::MAX, Vec::new());
-            for (row, &node) in (start..).zip(&self.nodes[start..end]) {
-                let at = place(node);
-                let mut sum = Vec4::ZERO;
-                for (set, lit) in transfer.direct.iter().zip(lit) {
-                    let each = 1 + set.terms;
-                    let clusters = set.clusters() * each;
-                    let cluster = usize::from(set.ids[row]) * each;
-                    let weights = &set.weights[row * set.terms..][..set.terms];
-                    let from = |view: usize| {
-                        let lit = &lit[view * clusters + cluster..][..each];
-                        let directions = weights.iter().zip(&lit[1..]);
-                        directions.fold(lit[0], |sum, (w, l)| sum + *l * *w)
-                    };
-                    sum += match &view {
-                        None => from(0),
-                        Some((view, seen)) => {
-                            let around = view.around(seen[row]);
-                            around.iter().fold(Vec4::ZERO, |sum, (v, w)| sum + from(*v as usize) * *w)
-                        }
-                    };
-                }
-                for sun in &self.suns {
-                    let scattered = match self.even {
-                        Some(_) => phase::value(0.0, 0.0),
-                        None => {
-                            let way = along(at).normalize_or(DVec3::Z).as_vec3();
-                            phase::value(transfer.medium.g, way.dot(sun.toward))
-                        }
-                    };
-                    (0..3).for_each(|c| sum[c] += scattered * sun.power[c] * sun.transmittance[c][row]);
-                }
-                if line.0 != at[1] {
-                    line = (at[1], self.cells.line([at[1], at[2]], &cells));
-                }
-                sum += self.cells.between(at[0], &line.1);
-                // A truncated series can dip below zero; radiance cannot.
-                let sum = sum.max(Vec4::ZERO);
-                out[node as usize - nx * ny * k] = [sum.x, sum.y, sum.z, field.values[node as usize]];
-            }
+        volume.write(field, |j, k, out| {
+            let at = j + field.dims[1] * k;
+            let rows = self.lines[at] as usize..self.lines[at + 1] as usize;
+            let nodes = &self.nodes[rows.clone()];
+            let (Some(from), Some(to)) = (nodes.first(), nodes.last()) else { return };
+            let before = at * out.len();
+            let cells = self.cells.line([j, k], [from, to].map(|&node| node as usize - before), &cells);
+            shade_line(self, &direct, &cells, Line { rows, before, first: along([0, j, k]), across }, out);
         });
-        ShadedVolume::new(field.dims, &shaded, field.world_from_node)
+    }
+}
+
+/// Direct light of clusters, as a view needs it.
+enum Direct<'a> {
+    /// The same from everywhere.
+    Even(&'a [LitClusters]),
+    /// For directions on a cube of so many squares.
+    Seen(&'a ViewDirections, usize, &'a [LitClusters]),
+    /// Black.
+    None,
+}
+
+/// Nodes along x.
+struct Line {
+    /// The lit ones, as rows of direct light.
+    rows: Range<usize>,
+    /// Nodes of the field before the line.
+    before: usize,
+    /// From the eye to its first node.
+    first: Vec3,
+    /// From node to node.
+    across: Vec3,
+}
+
+/// Writes the lit nodes of a line; `cells` are sums along it, see [`Cells::line`].
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn shade_line(source: &TransferSource, direct: &Direct, cells: &[Vec4], line: Line, out: &mut [[f32; 4]]) {
+    let g = source.transfer.medium.g;
+    for (row, &node) in line.rows.clone().zip(&source.nodes[line.rows]) {
+        let i = node as usize - line.before;
+        let way = line.first + line.across * i as f32;
+        let mut sum = source.cells.between(i, cells);
+        sum += match direct {
+            Direct::Even(lit) => source.direct(lit, row, [(0, 1.0)]),
+            Direct::Seen(view, squares, lit) => source.direct(lit, row, view.around(Between::of(way, *squares))),
+            Direct::None => Vec4::ZERO,
+        };
+        for sun in &source.suns {
+            let cosine = if g == 0.0 { 0.0 } else { way.normalize_or(Vec3::Z).dot(sun.toward) };
+            let scattered = phase::value(g, cosine);
+            (0..3).for_each(|c| sum[c] += scattered * sun.power[c] * sun.transmittance[c][row]);
+        }
+        // A truncated series can dip below zero; radiance cannot.
+        out[i] = sum.max(Vec4::ZERO).with_w(out[i][3]).to_array();
     }
 }
 
 impl TransferSource {
+    /// Direct radiance of the lit node `row`, a weighted mean of that along `views` of `lit`, by [`Self::lit_clusters`].
+    #[inline(always)]
+    fn direct<const N: usize>(&self, lit: &[LitClusters], row: usize, views: [(u32, f32); N]) -> Vec4 {
+        let mut sum = Vec4::ZERO;
+        for (set, lit) in self.transfer.direct.iter().zip(lit) {
+            let weights = &set.weights[row * set.terms..][..set.terms];
+            let (each, cluster) = (1 + set.terms, usize::from(set.ids[row]));
+            let of = |view: u32| &lit.radiance[view as usize * lit.each_view + cluster * each..][..each];
+            match weights.first_chunk::<4>() {
+                // What most packs have: views are blended first, twenty numbers at a time.
+                Some(weights) if each == 5 => {
+                    let mut blended = [0.0f32; 20];
+                    for (view, share) in views {
+                        let Some(radiance) = bytemuck::cast_slice::<_, f32>(of(view)).first_chunk::<20>() else {
+                            break;
+                        };
+                        (0..20).for_each(|at| blended[at] += share * radiance[at]);
+                    }
+                    let vector = |t: usize| Vec4::from_slice(&blended[4 * t..][..4]);
+                    sum += vector(0)
+                        + (vector(1) * weights[0] + vector(2) * weights[1])
+                        + (vector(3) * weights[2] + vector(4) * weights[3]);
+                }
+                _ => {
+                    for (view, share) in views {
+                        let radiance = of(view);
+                        let directions = radiance[1..].iter().zip(weights);
+                        sum += directions.fold(radiance[0], |sum, (d, w)| sum + *d * *w) * share;
+                    }
+                }
+            }
+        }
+        sum
+    }
+
     /// Indirect radiance of each cell the way it is seen from `eye`.
     fn seen_cells(&self, field: &DensityField, eye: DVec3) -> Vec<Vec4> {
-        let n = self.transfer.bands * self.transfer.bands;
+        let bands = self.transfer.bands;
+        let (n, side) = (bands * bands, self.cells.majorants.side);
         let [bx, by, _] = self.cells.majorants.bricks;
-        let mut middles = vec![DVec3::ZERO; self.cells.len()];
-        for (brick, &place) in self.cells.places.iter().enumerate().filter(|(_, p)| **p != super::cells::EMPTY) {
-            let at = [brick % bx, brick / bx % by, brick / bx / by];
-            let middle = DVec3::from_array(at.map(|b| (b as f64 + 0.5) * self.cells.majorants.side));
-            middles[place as usize] = field.world_from_node.transform_point3(middle);
-        }
-        let seen = |(moments, middle): (&[Vec4], &DVec3)| {
-            let harmonics = evaluate(self.transfer.bands, (*middle - eye).normalize_or(DVec3::Z).as_vec3());
-            let sum = moments.iter().zip(harmonics).fold(Vec4::ZERO, |sum, (m, y)| sum + *m * y);
-            // The last component counts cells, see [`Cells::line`].
-            sum.with_w(1.0)
+        let middle = |brick: usize| {
+            let at = [brick % bx, brick / bx % by, brick / bx / by].map(|b| (b as f64 + 0.5) * side);
+            (field.world_from_node.transform_point3(DVec3::from_array(at)) - eye).normalize_or(DVec3::Z).as_vec3()
         };
-        self.moments.par_chunks_exact(n).zip(&middles).map(seen).collect()
+        let mut out = vec![Vec4::ZERO; self.cells.len()];
+        let blocks = out.par_chunks_mut(1024).zip(self.moments.par_chunks(1024 * n));
+        blocks.zip(self.cells.bricks.par_chunks(1024)).for_each(|((out, moments), bricks)| {
+            let ways: Vec<Vec3> = bricks.iter().map(|&brick| middle(brick as usize)).collect();
+            along_ways(out, moments, &ways, bands);
+        });
+        out
     }
 }

@@ -2,12 +2,13 @@
 //!
 //! A cube around the eye has [`squares`] squares along a side of a face, the more the stronger light is scattered forward
 //! or back; only corners of squares that the smoke is seen through are used. Between corners values are bilinear: a band l
-//! of a function is off by `l (l + 1) h^2 / 8`, h the angle of a square, 0.1 radians at g = 0.5: 1.5 % of band 3, which
-//! has an eighth of the light. For an orthographic view all of it would be one direction (Zhang et al. 2013, Eq. 20,
+//! of a function is off by `l (l + 1) h^2 / 8` at most, h the angle of a square, 0.1 radians at g = 0.5: 1.5 % of band 3,
+//! which has an eighth of the light. For an orthographic view all of it would be one direction (Zhang et al. 2013, Eq. 20,
 //! evaluates one for each cluster, which is right for that view only).
-//! Cost: a few operations a node, once for the marks and once for the read.
+//! Cost: a few operations a node to read, and for a brick to mark what is used.
 
-use glam::DVec3;
+use glam::{DVec3, Vec3};
+use rayon::prelude::*;
 
 const UNUSED: u32 = u32::MAX;
 
@@ -33,10 +34,10 @@ pub struct Between {
 }
 
 impl Between {
-    /// The square of a vector from the eye of any length above 0, where a side of a face has so many; a zero vector counts
+    /// The square of a vector from the eye of any length, where a side of a face has so many; a zero vector counts
     /// as +x.
     #[inline(always)]
-    pub fn of(v: DVec3, squares: usize) -> Self {
+    pub fn of(v: Vec3, squares: usize) -> Self {
         let size = v.abs();
         let axis = if size.x >= size.y && size.x >= size.z {
             0
@@ -51,10 +52,10 @@ impl Between {
             _ => [v.z, v.x, v.y],
         };
         let scale = if major != 0.0 { 1.0 / major.abs() } else { 0.0 };
-        let place = [one, other].map(|c| (c * scale + 1.0) * (0.5 * squares as f64));
+        let place = [one, other].map(|c| (c * scale + 1.0) * (0.5 * squares as f32));
         let low = place.map(|p| (p as usize).min(squares - 1));
         let face = 2 * axis + usize::from(major < 0.0);
-        let fraction = [0, 1].map(|a| (place[a] - low[a] as f64) as f32);
+        let fraction = [0, 1].map(|a| place[a] - low[a] as f32);
         let corners = squares + 1;
         Self { square: (face * corners + low[1]) * corners + low[0], fraction }
     }
@@ -66,10 +67,38 @@ impl Between {
 }
 
 impl ViewDirections {
-    /// The corners of the squares that any of `seen`, made with as many squares, lie in.
-    pub fn of(seen: impl Iterator<Item = Between>, squares: usize) -> Self {
-        let mut marks = vec![false; 6 * (squares + 1) * (squares + 1)];
-        seen.for_each(|between| marks[between.square] = true);
+    /// The corners of the squares that the nodes of boxes lie in: node `[i, j, k]` at `corner + i edges[0] + ...` from the
+    /// eye, `0 <= i, j, k <= side`. A box whose corners are seen through one face lies between them there, as lines stay
+    /// lines; of others each node is looked at.
+    pub fn of_boxes(corners: &[Vec3], edges: [Vec3; 3], side: usize, squares: usize) -> Self {
+        let at = |corner: Vec3, [i, j, k]: [usize; 3]| {
+            let [i, j, k] = [i, j, k].map(|n| n as f32);
+            Between::of(corner + edges[0] * i + edges[1] * j + edges[2] * k, squares).square
+        };
+        let nothing = || vec![false; 6 * (squares + 1) * (squares + 1)];
+        let mark = |mut marks: Vec<bool>, corner: &Vec3| {
+            let n = squares + 1;
+            let (mut low, mut high) = ([usize::MAX; 3], [0; 3]);
+            for c in 0..8 {
+                let square = at(*corner, [c & 1, c >> 1 & 1, c >> 2].map(|bit| bit * side));
+                let place = [square % n, square / n % n, square / n / n];
+                (0..3).for_each(|a| (low[a], high[a]) = (low[a].min(place[a]), high[a].max(place[a])));
+            }
+            if low[2] == high[2] {
+                for row in low[1]..=high[1] {
+                    marks[(low[2] * n + row) * n..][low[0]..=high[0]].fill(true);
+                }
+            } else {
+                let n = side + 1;
+                (0..n * n * n).for_each(|v| marks[at(*corner, [v % n, v / n % n, v / n / n])] = true);
+            }
+            marks
+        };
+        let either = |mut a: Vec<bool>, b: Vec<bool>| {
+            a.iter_mut().zip(b).for_each(|(a, b)| *a |= b);
+            a
+        };
+        let marks = corners.par_iter().fold(nothing, mark).reduce(nothing, either);
         let mut places = vec![UNUSED; marks.len()];
         let mut directions = Vec::new();
         for square in (0..marks.len()).filter(|&s| marks[s]) {
@@ -119,9 +148,10 @@ mod tests {
     #[test]
     fn a_direction_lies_between_the_corners_of_its_square_whatever_its_face() {
         let seen: Vec<DVec3> = directions(5000).collect();
-        let view = ViewDirections::of(seen.iter().map(|v| Between::of(*v * 3.7, 32)), 32);
+        let points: Vec<Vec3> = seen.iter().map(|v| v.as_vec3() * 3.7).collect();
+        let view = ViewDirections::of_boxes(&points, [Vec3::ZERO; 3], 1, 32);
         for v in &seen {
-            let around = view.around(Between::of(*v, 32));
+            let around = view.around(Between::of(v.as_vec3() * 3.7, 32));
             assert!((around.iter().map(|a| a.1).sum::<f32>() - 1.0).abs() < 1e-6);
             let mean = around.iter().fold(DVec3::ZERO, |s, (d, w)| s + view.directions()[*d as usize] * f64::from(*w));
             // A linear function, off by h^2 / 8 at most.
@@ -131,12 +161,26 @@ mod tests {
     }
 
     #[test]
+    fn every_node_of_a_box_has_its_corners_near_and_far_around_the_eye_too() {
+        for corner in [Vec3::new(20.0, 3.0, -4.0), Vec3::new(-2.0, -1.5, -2.2), Vec3::new(3.0, -2.0, 2.9)] {
+            let edges = [Vec3::new(1.0, 0.1, 0.0), Vec3::Y, Vec3::new(0.0, -0.2, 1.0)];
+            let view = ViewDirections::of_boxes(&[corner], edges, 4, 20);
+            for v in 0..125 {
+                let at =
+                    corner + edges[0] * (v % 5) as f32 + edges[1] * (v / 5 % 5) as f32 + edges[2] * (v / 25) as f32;
+                let around = view.around(Between::of(at, 20));
+                assert!(around.iter().all(|(d, _)| (*d as usize) < view.directions().len()), "{at}");
+            }
+        }
+    }
+
+    #[test]
     fn only_what_is_seen_is_used_and_odd_vectors_are_no_trouble() {
-        let near = [DVec3::new(1.0, 0.1, 0.1), DVec3::new(1.0, 0.11, 0.1)].map(|v| Between::of(v, 12));
-        let view = ViewDirections::of(near.into_iter(), 12);
+        let near = [Vec3::new(1.0, 0.1, 0.1), Vec3::new(1.0, 0.11, 0.1)];
+        let view = ViewDirections::of_boxes(&near, [Vec3::X * 0.01, Vec3::Y * 0.001, Vec3::Z * 0.001], 4, 12);
         assert_eq!(view.directions().len(), 4);
-        for v in [DVec3::ZERO, DVec3::new(1.0, 1.0, 1.0), DVec3::new(-1.0, 1.0, -1.0), DVec3::new(0.0, -1e-300, 0.0)] {
-            let view = ViewDirections::of([v].map(|v| Between::of(v, 12)).into_iter(), 12);
+        for v in [Vec3::ZERO, Vec3::ONE, Vec3::new(-1.0, 1.0, -1.0), Vec3::new(0.0, -1e-38, 0.0), Vec3::splat(1e30)] {
+            let view = ViewDirections::of_boxes(&[v], [Vec3::ZERO; 3], 1, 12);
             assert!(view.around(Between::of(v, 12)).iter().all(|(d, w)| (*d as usize) < 4 && w.is_finite()));
         }
     }

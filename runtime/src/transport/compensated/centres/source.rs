@@ -5,10 +5,10 @@
 
 use super::single::CentreRadiance;
 use super::volume_pass::{ViewDirections, volume_pass};
-use crate::march::ShadedVolume;
 use crate::medium::field::DensityField;
 use crate::medium::frame::Frame;
 use crate::medium::gaussian_points::GaussianPoints;
+use crate::shaded_volume::ShadedVolume;
 use crate::transport::SourceRadiance;
 use glam::{DAffine3, DMat3, DVec3};
 use smoke_formats::gaussian::UnitSpace;
@@ -58,11 +58,14 @@ impl SourceRadiance for CentreSource {
         self.radiance.coefficients.chunks_exact(bands).any(|j| j[1..].iter().any(|v| *v != [0.0; 3]))
     }
 
-    fn shade(&self, field: &DensityField, eye: DVec3) -> ShadedVolume {
+    fn shade(&self, field: &DensityField, eye: DVec3, volume: &mut ShadedVolume) {
         let eye = self.placement.unit_from_world.transform_point3(eye).as_vec3().to_array();
         let view = ViewDirections::Eye(eye);
         let source = volume_pass(&self.points, &self.radiance, &self.unit, self.first_node, field.dims, view);
-        let nodes: Vec<[f32; 4]> = source.iter().zip(&field.values).map(|(&[r, g, b], &d)| [r, g, b, d]).collect();
-        ShadedVolume::new(field.dims, &nodes, field.world_from_node)
+        let [nx, ny, _] = field.dims;
+        volume.write(field, |j, k, out| {
+            let row = &source[nx * (j + ny * k)..][..nx];
+            out.iter_mut().zip(row).for_each(|(out, &[r, g, b])| *out = [r, g, b, out[3]]);
+        });
     }
 }

@@ -35,6 +35,7 @@ mod tests {
     use crate::light::{Environment, beams};
     use crate::march::{Black, MarchMedium, MarchSettings, march};
     use crate::medium::field::DensityField;
+    use crate::shaded_volume::ShadedVolume;
     use crate::transport::compensated::grid::route::{GridSettings, GridSource, GridTransport};
     use crate::transport::{ScatteringOrder, SourceRadiance};
     use glam::{DAffine3, DVec3, Vec3};
@@ -82,7 +83,9 @@ mod tests {
             assert_eq!((one.channels, three.channels, one.iterations), (1, 3, three.iterations));
             let view = |source: &GridSource| {
                 let settings = MarchSettings::default();
-                march(&source.shade(&field, eye), &camera, &MarchMedium::plain([6.0; 3]), &Black, &settings)
+                let mut volume = ShadedVolume::of(&field);
+                source.shade(&field, eye, &mut volume);
+                march(&volume, &camera, &MarchMedium::plain([6.0; 3]), &Black, &settings)
             };
             let mut seen = 0;
             for (a, b) in view(&one).pixels.iter().zip(&view(&three).pixels) {

@@ -13,8 +13,8 @@ use super::columns::SweepGrid;
 use super::scatter::{Ordinate, gather};
 use super::single::{WeightedBeam, single_scattering};
 use crate::light::Beam;
-use crate::march::ShadedVolume;
 use crate::medium::field::DensityField;
+use crate::shaded_volume::ShadedVolume;
 use crate::sphere::harmonics::{BAND, MAX_ORDER, evaluate};
 use crate::sphere::quadrature::Directions;
 use crate::transport::compensated::gmres;
@@ -214,20 +214,17 @@ impl SourceRadiance for GridSource {
         self.single.planes.len() > self.channels
     }
 
-    fn shade(&self, field: &DensityField, eye: DVec3) -> ShadedVolume {
-        let [nx, ny, _] = field.dims;
+    fn shade(&self, field: &DensityField, eye: DVec3, volume: &mut ShadedVolume) {
+        let nx = field.dims[0];
         let node_eye = field.world_from_node.inverse().transform_point3(eye);
         let linear = field.world_from_node.matrix3;
         let channels = self.channels;
         let bands = (self.single.planes.len() / channels).isqrt();
-        let mut nodes = vec![[0.0f32; 4]; field.values.len()];
-        nodes.par_chunks_mut(nx).enumerate().for_each(|(line, out)| {
-            let (j, k) = (line % ny, line / ny);
+        volume.write(field, |j, k, out| {
             // Only nodes next to density are ever fetched with weight on a sample that has any.
             if !near_density(field, j, k) {
                 return;
             }
-            let density = &field.values[line * nx..][..nx];
             let mut harmonics = vec![[0.0f32; MAX_ORDER * MAX_ORDER]; if bands > 1 { nx } else { 0 }];
             for (i, y) in harmonics.iter_mut().enumerate() {
                 // Look convention: the direction in which the ray that passes here goes on.
@@ -251,10 +248,9 @@ impl SourceRadiance for GridSource {
             for (i, node) in out.iter_mut().enumerate() {
                 // A truncated series can dip below zero beside a strong peak; radiance cannot.
                 let [red, green, blue] = [0, channels / 2, channels - 1].map(|c| sum[c][i].max(0.0));
-                *node = [red, green, blue, density[i]];
+                *node = [red, green, blue, node[3]];
             }
         });
-        ShadedVolume::new(field.dims, &nodes, field.world_from_node)
     }
 }
 
@@ -328,12 +324,18 @@ mod tests {
         let centre = field.world_from_node.transform_point3(DVec3::splat(12.5));
         let camera = Camera::look_at(centre - DVec3::new(5.0, 0.3, 0.2), centre, DVec3::Z, 20.0, 24, 24);
         march(
-            &source.shade(field, camera.position),
+            &shaded(&source, field, camera.position),
             &camera,
             &MarchMedium::plain(banded.sigma_t),
             &Black,
             &MarchSettings::default(),
         )
+    }
+
+    fn shaded(source: &GridSource, field: &DensityField, eye: DVec3) -> ShadedVolume {
+        let mut volume = ShadedVolume::of(field);
+        source.shade(field, eye, &mut volume);
+        volume
     }
 
     fn grey(sigma_t: f32, albedo: f32, g: f32) -> MediumParameters {
@@ -487,7 +489,7 @@ mod tests {
             let target = field.world_from_node.transform_point3(DVec3::splat(12.5));
             let camera = Camera::look_at(eye(x), target, DVec3::Z, 20.0, 16, 16);
             march(
-                &source.shade(&field, camera.position),
+                &shaded(source, &field, camera.position),
                 &camera,
                 &MarchMedium::plain([4.0; 3]),
                 &Black,
