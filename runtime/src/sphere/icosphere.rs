@@ -18,6 +18,9 @@ pub struct Icosphere {
     directions: Vec<DVec3>,
     /// The triangles of every level, coarsest first; children 4t .. 4t + 4 of triangle t are on the next.
     levels: Vec<Vec<[u32; 3]>>,
+    /// For each level and triangle `abc`, `b x c`, `c x a`, `a x b`: how far inside a direction is of the sides across from
+    /// a, b, c, and its place between them once their sum is made 1.
+    sides: Vec<Vec<[DVec3; 3]>>,
 }
 
 impl Icosphere {
@@ -44,7 +47,12 @@ impl Icosphere {
             }
             levels.push(finer);
         }
-        Self { level, directions, levels }
+        let sides = |&triangle: &[u32; 3]| {
+            let [a, b, c] = triangle.map(|n| directions[n as usize]);
+            [b.cross(c), c.cross(a), a.cross(b)]
+        };
+        let sides = levels.iter().map(|triangles| triangles.iter().map(sides).collect()).collect();
+        Self { level, directions, levels, sides }
     }
 
     /// The level with `nodes` nodes, if there is one.
@@ -70,12 +78,8 @@ impl Icosphere {
     /// The triangle that holds a unit direction; one of both on a common side.
     pub fn triangle(&self, direction: DVec3) -> usize {
         // How far inside its worst side; the best triangle is taken, so that rounding never finds none.
-        let inside = |[a, b, c]: [u32; 3]| {
-            let [a, b, c] = [a, b, c].map(|n| self.directions[n as usize]);
-            let side = |p: DVec3, q: DVec3| p.cross(q).dot(direction);
-            side(a, b).min(side(b, c)).min(side(c, a))
-        };
-        let best = |candidates: std::ops::Range<usize>, triangles: &[[u32; 3]]| {
+        let inside = |[a, b, c]: [DVec3; 3]| a.dot(direction).min(b.dot(direction)).min(c.dot(direction));
+        let best = |candidates: std::ops::Range<usize>, triangles: &[[DVec3; 3]]| {
             let mut best = (f64::NEG_INFINITY, candidates.start);
             for t in candidates {
                 let depth = inside(triangles[t]);
@@ -88,11 +92,19 @@ impl Icosphere {
             }
             best.1
         };
-        let mut found = best(0..20, &self.levels[0]);
-        for triangles in &self.levels[1..] {
+        let mut found = best(0..20, &self.sides[0]);
+        for triangles in &self.sides[1..] {
             found = best(4 * found..4 * found + 4, triangles);
         }
         found
+    }
+
+    /// The place of a unit direction between the corners of a triangle of the finest level: the direction is their sum times
+    /// these, up to its length. >= 0 inside, sum 1.
+    pub fn barycentric(&self, triangle: usize, direction: DVec3) -> [f64; 3] {
+        let inside = self.sides[self.sides.len() - 1][triangle].map(|side| side.dot(direction).max(0.0));
+        let sum: f64 = inside.iter().sum();
+        inside.map(|v| v / sum)
     }
 
     /// Solid angle of a triangle of the finest level (Van Oosterom and Strackee 1983).
