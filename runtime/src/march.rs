@@ -16,13 +16,14 @@ use crate::lanes::exp_neg_and_rest;
 use glam::{DAffine3, DVec3, Vec4};
 use multiversion::multiversion;
 use rayon::prelude::*;
+use std::ops::Range;
 
 /// Cells along a side of a brick.
 const BRICK: usize = 4;
 /// Nodes along a side of a brick: those of its far faces belong to its neighbours as well.
 const SIDE: usize = BRICK + 1;
 /// Nodes of a brick.
-const BRICK_NODES: usize = SIDE * SIDE * SIDE;
+pub(crate) const BRICK_NODES: usize = SIDE * SIDE * SIDE;
 /// Node of the last cell of a brick.
 const LAST_CELL: usize = (BRICK - 1) * (1 + SIDE + SIDE * SIDE);
 /// Samples that are placed and exponentiated together.
@@ -40,11 +41,43 @@ pub struct ShadedVolume {
     dims: [usize; 3],
     /// `[J red, J green, J blue, D]` of the nodes of each brick with density, x fastest.
     nodes: Vec<[[f32; 4]; BRICK_NODES]>,
-    /// Where in `nodes` a brick is, or [`EMPTY`]; x fastest.
-    places: Vec<u32>,
-    bricks: [usize; 3],
+    table: BrickTable,
     world_from_node: DAffine3,
     density_max: f32,
+}
+
+/// Which bricks of a box have density.
+pub(crate) struct BrickTable {
+    /// Along x, y, z.
+    pub(crate) bricks: [usize; 3],
+    /// Numbers of the dense ones, x fastest, in order.
+    pub(crate) dense: Vec<usize>,
+    /// Where in `dense` a brick is, or [`EMPTY`]; x fastest.
+    pub(crate) places: Vec<u32>,
+}
+
+impl BrickTable {
+    /// Of a box of `dims` nodes; `is_dense` tells whether any of a range of them, all of one row, has density.
+    pub(crate) fn new(dims: [usize; 3], is_dense: impl Fn(Range<usize>) -> bool + Sync) -> Self {
+        let bricks = dims.map(|n| (n - 1).div_ceil(BRICK));
+        let count = bricks.iter().product();
+        let dense = |b: &usize| rows(dims, bricks, *b).any(|(_, row)| is_dense(row));
+        let dense: Vec<usize> = (0..count).into_par_iter().filter(dense).collect();
+        let mut places = vec![EMPTY; count];
+        dense.iter().enumerate().for_each(|(place, &b)| places[b] = place as u32);
+        Self { bricks, dense, places }
+    }
+}
+
+/// The rows of nodes of brick `b`: the place of the first in the brick, and all in the box.
+fn rows(dims: [usize; 3], bricks: [usize; 3], b: usize) -> impl Iterator<Item = (usize, Range<usize>)> {
+    let first = [b % bricks[0], b / bricks[0] % bricks[1], b / bricks[0] / bricks[1]].map(|b| b * BRICK);
+    let end = [0, 1, 2].map(|a| (first[a] + SIDE).min(dims[a]));
+    let lines = (first[2]..end[2]).flat_map(move |k| (first[1]..end[1]).map(move |j| (j, k)));
+    lines.map(move |(j, k)| {
+        let start = dims[0] * (j + dims[1] * k);
+        (SIDE * (j - first[1] + SIDE * (k - first[2])), start + first[0]..start + end[0])
+    })
 }
 
 /// The dials of the march.
@@ -71,44 +104,43 @@ impl ShadedVolume {
     /// A volume of `nodes` (`[J red, J green, J blue, D]`, x fastest, border included).
     pub fn new(dims: [usize; 3], nodes: &[[f32; 4]], world_from_node: DAffine3) -> Self {
         assert_eq!(nodes.len(), dims.iter().product::<usize>(), "one value a node");
-        let bricks = dims.map(|n| (n - 1).div_ceil(BRICK));
-        let count = bricks.iter().product();
-        let corners = |b: usize| {
-            let first = [b % bricks[0], b / bricks[0] % bricks[1], b / bricks[0] / bricks[1]].map(|b| b * BRICK);
-            (first, [0, 1, 2].map(|a| (first[a] + SIDE).min(dims[a])))
-        };
-        let rows = |(first, end): ([usize; 3], [usize; 3])| {
-            let lines = (first[2]..end[2]).flat_map(move |k| (first[1]..end[1]).map(move |j| (j, k)));
-            lines.map(move |(j, k)| {
-                let start = dims[0] * (j + dims[1] * k);
-                let place = SIDE * (j - first[1] + SIDE * (k - first[2]));
-                (place, &nodes[start + first[0]..start + end[0]])
-            })
-        };
-        let is_dense = |b: &usize| rows(corners(*b)).any(|(_, row)| row.iter().any(|n| n[3] > 0.0));
-        let dense: Vec<usize> = (0..count).into_par_iter().filter(is_dense).collect();
+        let table = BrickTable::new(dims, |row| nodes[row].iter().any(|n| n[3] > 0.0));
         let copy = |b: &usize| {
             let mut brick = [[0.0; 4]; BRICK_NODES];
-            rows(corners(*b)).for_each(|(place, row)| brick[place..][..row.len()].copy_from_slice(row));
+            rows(dims, table.bricks, *b)
+                .for_each(|(place, row)| brick[place..][..row.len()].copy_from_slice(&nodes[row]));
             brick
         };
-        let out: Vec<_> = dense.par_iter().map(copy).collect();
-        let mut places = vec![EMPTY; count];
-        dense.iter().enumerate().for_each(|(place, &b)| places[b] = place as u32);
+        let out: Vec<_> = table.dense.par_iter().map(copy).collect();
         let density_max = nodes.par_iter().map(|n| n[3]).reduce(|| 0.0, f32::max);
-        Self { dims, nodes: out, places, bricks, world_from_node, density_max }
+        Self { dims, nodes: out, table, world_from_node, density_max }
     }
 
-    /// World length between samples.
-    fn sample_distance(&self, step: f32, sigma_t: [f32; 3]) -> f64 {
-        let sides = [0, 1, 2].map(|a| self.world_from_node.matrix3.col(a).length());
-        let voxel = sides.into_iter().fold(f64::INFINITY, f64::min);
-        if step > 0.0 {
-            return voxel * f64::from(step);
-        }
-        let thickest = f64::from(sigma_t.into_iter().fold(0.0, f32::max)) * f64::from(self.density_max) * voxel;
-        // No density at all divides by zero, and takes the largest step.
-        voxel * (DEPTH_PER_SAMPLE / thickest).clamp(LEAST_STEP, 1.0)
+    /// Nodes along x, y, z.
+    pub fn dims(&self) -> [usize; 3] {
+        self.dims
+    }
+
+    /// Node to world space.
+    pub fn world_from_node(&self) -> DAffine3 {
+        self.world_from_node
+    }
+
+    /// Largest density.
+    pub fn density_max(&self) -> f32 {
+        self.density_max
+    }
+
+    /// `[J red, J green, J blue, D]` of the nodes of each brick with density: 5 along each side, x fastest; brick after
+    /// brick, x fastest.
+    pub fn nodes(&self) -> &[[[f32; 4]; BRICK_NODES]] {
+        &self.nodes
+    }
+
+    /// Which bricks have density.
+    #[cfg(feature = "gpu")]
+    pub(crate) fn table(&self) -> &BrickTable {
+        &self.table
     }
 
     /// Largest and smallest distance along a ray inside the box, or none.
@@ -128,6 +160,18 @@ impl ShadedVolume {
         }
         (near < far).then_some((near, far))
     }
+}
+
+/// World length between samples.
+pub(crate) fn sample_distance(world_from_node: &DAffine3, density_max: f32, step: f32, sigma_t: [f32; 3]) -> f64 {
+    let sides = [0, 1, 2].map(|a| world_from_node.matrix3.col(a).length());
+    let voxel = sides.into_iter().fold(f64::INFINITY, f64::min);
+    if step > 0.0 {
+        return voxel * f64::from(step);
+    }
+    let thickest = f64::from(sigma_t.into_iter().fold(0.0, f32::max)) * f64::from(density_max) * voxel;
+    // No density at all divides by zero, and takes the largest step.
+    voxel * (DEPTH_PER_SAMPLE / thickest).clamp(LEAST_STEP, 1.0)
 }
 
 /// `[J, D]` in cell `at` (its first node) of a brick, at `f` within the cell.
@@ -193,7 +237,7 @@ pub fn march(
     settings: &MarchSettings,
 ) -> Film {
     let node_from_world = volume.world_from_node.inverse();
-    let ds = volume.sample_distance(settings.step, medium.sigma_t);
+    let ds = sample_distance(&volume.world_from_node, volume.density_max, settings.step, medium.sigma_t);
     let origin = node_from_world.transform_point3(camera.position);
     let view = View { volume, camera, medium, backdrop, node_from_world, origin, ds, settings };
     if settings.half_resolution {
@@ -321,7 +365,7 @@ fn march_ray(volume: &ShadedVolume, ray: &Ray, sigma_t: [f32; 3], cutoff: f32) -
     let mut state = State { radiance: Vec4::ZERO, transmittance: Vec4::ONE, first: f64::INFINITY };
     let mut samples = Samples::default();
     let inside = ray.origin + ray.direction * (near + 1e-6 * ray.ds);
-    let mut brick = [0, 1, 2].map(|a| ((inside[a] / BRICK as f64).max(0.0) as usize).min(volume.bricks[a] - 1));
+    let mut brick = [0, 1, 2].map(|a| ((inside[a] / BRICK as f64).max(0.0) as usize).min(volume.table.bricks[a] - 1));
     // Distance at which the ray leaves its brick along each axis, and from there on from brick to brick.
     let (mut leaves, mut between) = ([f64::INFINITY; 3], [f64::INFINITY; 3]);
     for a in 0..3 {
@@ -346,7 +390,8 @@ fn march_ray(volume: &ShadedVolume, ray: &Ray, sigma_t: [f32; 3], cutoff: f32) -
         };
         let exit = leaves[axis];
         let after = number(exit.min(far)).max(next);
-        let place = volume.places[brick[0] + volume.bricks[0] * (brick[1] + volume.bricks[1] * brick[2])];
+        let place =
+            volume.table.places[brick[0] + volume.table.bricks[0] * (brick[1] + volume.table.bricks[1] * brick[2])];
         if place != EMPTY && after > next {
             let corner = DVec3::new(brick[0] as f64, brick[1] as f64, brick[2] as f64) * BRICK as f64;
             let start = (ray.origin + ray.direction * ((next + 0.5) * ray.ds) - corner).as_vec3();
@@ -359,7 +404,7 @@ fn march_ray(volume: &ShadedVolume, ray: &Ray, sigma_t: [f32; 3], cutoff: f32) -
         }
         next = after;
         brick[axis] = if ray.direction[axis] > 0.0 { brick[axis] + 1 } else { brick[axis].wrapping_sub(1) };
-        if exit >= far || brick[axis] >= volume.bricks[axis] {
+        if exit >= far || brick[axis] >= volume.table.bricks[axis] {
             state.add(volume, &mut samples, &optics);
             return state.pixel(ray);
         }
@@ -500,10 +545,10 @@ mod tests {
     fn stepping_over_empty_bricks_and_stopping_early_change_no_more_than_they_promise() {
         let (volume, camera) = slab(1.0, 1.0);
         let mut dense = slab(1.0, 1.0).0;
-        assert!(dense.places.contains(&EMPTY), "there must be something to step over");
+        assert!(dense.table.places.contains(&EMPTY), "there must be something to step over");
         let none = dense.nodes.len() as u32;
         dense.nodes.push([[1.0, 1.0, 1.0, 0.0]; BRICK_NODES]);
-        dense.places.iter_mut().filter(|p| **p == EMPTY).for_each(|p| *p = none);
+        dense.table.places.iter_mut().filter(|p| **p == EMPTY).for_each(|p| *p = none);
         let settings = MarchSettings { step: 0.5, cutoff: 0.0, ..Default::default() };
         let (a, b) = (see(&volume, &camera, [0.3; 3], &settings), see(&dense, &camera, [0.3; 3], &settings));
         assert_eq!(a.pixels, b.pixels);

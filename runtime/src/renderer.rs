@@ -10,6 +10,7 @@ use crate::camera::Camera;
 use crate::film::Film;
 use crate::light::{Beam, Light, beams};
 use crate::march::{MarchMedium, MarchSettings, ShadedVolume, march};
+use crate::medium::field::DensityField;
 use crate::medium::frame::Frame;
 use crate::transport::compensated::centres::incident::incident;
 use crate::transport::compensated::centres::route::{CentreError, CentreSettings, CentreTransport, MultipleScattering};
@@ -222,34 +223,53 @@ impl Renderer {
     /// The image from `camera`, and the seconds it took; an image of empty pixels before any frame.
     pub fn render(&mut self, camera: &Camera) -> Result<(Film, Seconds), RenderError> {
         let mut seconds = Seconds::default();
-        let Some(loaded) = &mut self.loaded else { return Ok((Film::new(camera.width, camera.height), seconds)) };
         let start = Instant::now();
-        let (source, medium) = match &self.source {
-            Some(source) => source,
-            None => {
-                let beams = match self.settings.route {
-                    Route::Grid(grid) => self.beams.get_or_insert_with(|| beams(&self.lights, grid.beams)).as_slice(),
-                    Route::Centres(_) | Route::Transfer(_) => &[],
-                };
-                self.source.insert(solve(loaded, &self.settings, &self.medium, &self.lights, beams)?)
-            }
+        let Some((lit, shaded)) = self.lit()? else {
+            return Ok((Film::new(camera.width, camera.height), seconds));
         };
         seconds.source_radiance = start.elapsed().as_secs_f64();
         let start = Instant::now();
-        let still_good = |eye: DVec3| eye == camera.position || !source.depends_on_view();
-        let shaded = match self.shaded.take() {
+        let still_good = |eye: DVec3| eye == camera.position || !lit.source.depends_on_view();
+        let volume = match shaded.take() {
             Some((volume, eye)) if still_good(eye) => (volume, eye),
-            _ => (source.shade(&loaded.frame.field, camera.position), camera.position),
+            _ => (lit.source.shade(lit.field, camera.position), camera.position),
         };
-        let shaded = &self.shaded.insert(shaded).0;
+        let volume = &shaded.insert(volume).0;
         seconds.volume_pass = start.elapsed().as_secs_f64();
         let start = Instant::now();
-        let peak = (medium.peak_ratio != [1.0; 3]).then_some((self.medium.g, self.settings.sh_order));
-        let sky = self.sky.get_or_insert_with(|| Sky::new(&self.lights, peak));
-        let film = march(shaded, camera, medium, sky, &self.settings.march);
+        let film = march(volume, camera, lit.medium, lit.sky, lit.march);
         seconds.view_pass = start.elapsed().as_secs_f64();
         Ok((film, seconds))
     }
+
+    /// Solves for the source radiance, if an edit has dropped it. None before any frame.
+    pub(crate) fn lit(&mut self) -> Result<Option<LitAndShaded<'_>>, RenderError> {
+        let Some(loaded) = &mut self.loaded else { return Ok(None) };
+        if self.source.is_none() {
+            let beams = match self.settings.route {
+                Route::Grid(grid) => self.beams.get_or_insert_with(|| beams(&self.lights, grid.beams)).as_slice(),
+                Route::Centres(_) | Route::Transfer(_) => &[],
+            };
+            self.source = Some(solve(loaded, &self.settings, &self.medium, &self.lights, beams)?);
+        }
+        let Some((source, medium)) = &self.source else { return Ok(None) };
+        let peak = (medium.peak_ratio != [1.0; 3]).then_some((self.medium.g, self.settings.sh_order));
+        let sky = self.sky.get_or_insert_with(|| Sky::new(&self.lights, peak));
+        let (field, march) = (&loaded.frame.field, &self.settings.march);
+        Ok(Some((Lit { field, source: source.as_ref(), medium, sky, march }, &mut self.shaded)))
+    }
+}
+
+/// What passes after the solution need, and the place where the shaded volume is kept.
+pub(crate) type LitAndShaded<'a> = (Lit<'a>, &'a mut Option<(ShadedVolume, DVec3)>);
+
+/// A frame under its lights.
+pub(crate) struct Lit<'a> {
+    pub(crate) field: &'a DensityField,
+    pub(crate) source: &'a dyn SourceRadiance,
+    pub(crate) medium: &'a MarchMedium,
+    pub(crate) sky: &'a Sky,
+    pub(crate) march: &'a MarchSettings,
 }
 
 fn solve(
