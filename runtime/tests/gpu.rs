@@ -28,9 +28,10 @@ use std::sync::Arc;
 
 /// Relative RMSE of images: what the device is promised to keep.
 const IMAGE: f64 = 2e-3;
-/// Relative RMSE of a pass on the same input: places to 2e-7 of a box of 100 nodes move a density by 2e-5 of a node's
-/// difference, and a rare sample beside a face, or a ray that ends one sample later (cut-off 1e-3), by more.
-const PASS: f64 = 2e-4;
+/// Relative RMSE of a march of the same volume. Places are good to 2e-7 of the box's side, so that a density is off by 2e-5
+/// of the difference between nodes; Vulkan allows `exp` 3 + 2x units in the last place, and `atan2` 4,096, which is 1e-4
+/// of the test's sky. A software device keeps 3e-7.
+const PASS: f64 = 1e-4;
 
 /// The device, or none where tests are told to do without or there is none; says which.
 fn device(forced: ForcedLimits) -> Option<Arc<Gpu>> {
@@ -56,8 +57,7 @@ fn told(cases: usize) {
 fn plume(number: i32) -> DensityField {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("../testdata/plume/plume.{number:04}.vdb"));
     let grid = volume::read(&path, "density").unwrap();
-    let dims = [0, 1, 2].map(|a| grid.dims[a] as usize);
-    DensityField::from_box(grid.origin, dims, &grid.values, DAffine3::from_cols_array(&grid.world_from_index))
+    DensityField::from_box(grid.origin, grid.dims, &grid.values, grid.world_from_index)
 }
 
 /// A box of 7 x 5 x 6 voxels without symmetry, stretched and turned.
@@ -123,11 +123,9 @@ fn films_differ(gpu: &Gpu, pass: &MarchPass, shaded: &ShadedVolume, volume: &Dev
         let (found, _) = pass.film(gpu, volume, camera, &medium, &on_device, &settings).unwrap();
         worst = worst.max(difference(&radiance(&expected), &radiance(&found)));
         // Depth is the first sample with density: a rounding makes it the next in a few pixels.
-        let agree = |(a, b): &(_, _)| -> bool {
-            let (a, b): (&smoke_runtime::film::Pixel, &smoke_runtime::film::Pixel) = (a, b);
-            a.depth == b.depth || (a.depth - b.depth).abs() <= 1e-5 * a.depth.abs()
-        };
-        let same = expected.pixels.iter().zip(&found.pixels).filter(agree).count();
+        let agree = |a: f32, b: f32| a == b || (a - b).abs() <= 1e-5 * a.abs();
+        let pairs = expected.pixels.iter().zip(&found.pixels);
+        let same = pairs.filter(|(a, b)| agree(a.depth, b.depth)).count();
         let share = same as f64 / expected.pixels.len() as f64;
         assert!(worst > PASS || share > 0.98, "depth agrees in {share} of the pixels");
     }
@@ -214,7 +212,7 @@ fn a_difference_planted_in_a_shader_is_found_by_the_comparison_of_its_pass() {
         ("march.peak_ratio.xyz)", "march.peak_ratio.xyz * 1.02)"),
         ("environment.rotation) / TAU", "environment.rotation * 1.05) / TAU"),
         ("acos(clamp(d.z", "acos(clamp(-d.z"),
-        (" < march.cutoff", " < 30.0 * march.cutoff"),
+        (" < march.cutoff", " < 300.0 * march.cutoff"),
     ] {
         assert!(march::SHADER.contains(from), "{from}");
         let pass = MarchPass::from_source(&gpu, &march::SHADER.replace(from, to)).unwrap();

@@ -11,6 +11,8 @@ use std::sync::mpsc;
 pub const GROUP: u32 = 64;
 /// Groups along one axis.
 const MOST_GROUPS: u32 = 65_535;
+/// Bytes of a buffer at least: a binding must hold one element of its array, even if the array is empty.
+const LEAST_BYTES: u64 = 64;
 /// Text that all kernels begin with.
 pub const PRELUDE: &str = include_str!("pass.wgsl");
 
@@ -61,7 +63,7 @@ fn groups(threads: u32) -> [u32; 2] {
 }
 
 impl Gpu {
-    /// A buffer that holds `values`, of at least 16 bytes; refused if a shader could not see all of it.
+    /// A buffer that holds `values`, never of none; refused if a shader could not see all of it.
     pub fn upload<T: Pod>(&self, what: &'static str, values: &[T]) -> Result<wgpu::Buffer, GpuError> {
         let bytes: &[u8] = bytemuck::cast_slice(values);
         let buffer = self.storage(what, bytes.len() as u64)?;
@@ -69,7 +71,7 @@ impl Gpu {
         Ok(buffer)
     }
 
-    /// A storage buffer of zeros, of at least 16 bytes; refused if a shader could not see all of it.
+    /// A storage buffer of zeros, never of none; refused if a shader could not see all of it.
     pub fn storage(&self, what: &'static str, bytes: u64) -> Result<wgpu::Buffer, GpuError> {
         let limit = self.summary().storage_binding.min(self.summary().buffer);
         if bytes > limit {
@@ -89,7 +91,7 @@ impl Gpu {
     }
 
     fn buffer(&self, label: &'static str, bytes: u64, usage: wgpu::BufferUsages) -> wgpu::Buffer {
-        let size = bytes.max(16).next_multiple_of(4);
+        let size = bytes.max(LEAST_BYTES).next_multiple_of(4);
         self.device.create_buffer(&wgpu::BufferDescriptor {
             label: Some(label),
             size,
