@@ -7,6 +7,7 @@ mod compare;
 mod compensated;
 mod contact_sheet;
 mod demo;
+mod devices;
 mod failure;
 mod inspect;
 mod layers;
@@ -56,5 +57,6 @@ fn dispatch(command: Command) -> Result<(), Failure> {
         Command::Compare(args) => compare::run(&args),
         Command::Sweep(args) => sweep::run(&args),
         Command::Demo(args) => demo::run(&args),
+        Command::Devices(args) => devices::run(&args),
     }
 }

@@ -1,6 +1,7 @@
 //! The methods that `render` and its kin make images by, treated alike: options in, a frame's image and its story out.
 
 use crate::cli::{MethodChoice, RenderArgs};
+use crate::devices::Device;
 use crate::failure::Failure;
 use crate::staging::Stage;
 use crate::{compensated, plan, reference, transfer};
@@ -8,6 +9,8 @@ use clap::error::ErrorKind;
 use serde_json::{Value, json};
 use smoke_formats::pack::Pack;
 use smoke_runtime::film::Film;
+#[cfg(feature = "gpu")]
+use smoke_runtime::gpu::renderer::GpuRenderer;
 use smoke_runtime::light::Light;
 use smoke_runtime::medium::frame::Frame;
 use smoke_runtime::plan::choose::Settings;
@@ -30,6 +33,9 @@ pub enum Method {
 pub enum Maker<'a> {
     /// Keeps what frames have in common.
     Marched(Box<Renderer>, &'a Stage),
+    /// The same, on a graphics device.
+    #[cfg(feature = "gpu")]
+    OnDevice(Box<GpuRenderer>, &'a Stage),
     /// Keeps nothing.
     Reference(ReferenceSettings, &'a Stage),
 }
@@ -106,14 +112,23 @@ impl Method {
         }
     }
 
-    /// Ready for frames under the lights and medium of `stage`.
-    pub fn maker<'a>(&self, stage: &'a Stage) -> Result<Maker<'a>, String> {
-        Ok(match self {
-            Self::Compensated(settings) | Self::Transfer(settings) => {
+    /// Ready for frames under the lights and medium of `stage`, on `device`.
+    pub fn maker<'a>(&self, stage: &'a Stage, device: &Device) -> Result<Maker<'a>, String> {
+        Ok(match (self, device) {
+            (Self::Compensated(settings) | Self::Transfer(settings), Device::Cpu) => {
                 let renderer = Renderer::new(*settings, stage.medium, stage.lights.clone());
                 Maker::Marched(Box::new(renderer.map_err(|e| e.to_string())?), stage)
             }
-            Self::Reference(settings) => Maker::Reference(*settings, stage),
+            (Self::Reference(settings), Device::Cpu) => Maker::Reference(*settings, stage),
+            #[cfg(feature = "gpu")]
+            (Self::Compensated(settings) | Self::Transfer(settings), Device::Gpu(gpu)) => {
+                let renderer = GpuRenderer::new(gpu.clone(), *settings, stage.medium, stage.lights.clone());
+                Maker::OnDevice(Box::new(renderer.map_err(|e| e.to_string())?), stage)
+            }
+            #[cfg(feature = "gpu")]
+            (Self::Reference(_), Device::Gpu(_)) => {
+                return Err("method: found reference, expected another on a graphics device; use --device cpu".into());
+            }
         })
     }
 }
@@ -127,11 +142,14 @@ impl Maker<'_> {
                 renderer.set_frame(frame).map_err(|e| e.to_string())?;
                 let prepared = start.elapsed().as_secs_f64();
                 let (film, seconds) = renderer.render(&stage.camera).map_err(|e| e.to_string())?;
-                let Seconds { source_radiance, volume_pass, view_pass } = seconds;
-                let source_radiance = source_radiance + prepared;
-                let stages =
-                    [("source_radiance", source_radiance), ("volume_pass", volume_pass), ("view_pass", view_pass)];
-                Ok(Image { film, standard_error: None, seconds: stages.to_vec(), figures: json!({}) })
+                Ok(marched(film, seconds, prepared))
+            }
+            #[cfg(feature = "gpu")]
+            Self::OnDevice(renderer, stage) => {
+                renderer.set_frame(frame).map_err(|e| e.to_string())?;
+                let prepared = start.elapsed().as_secs_f64();
+                let (film, seconds) = renderer.render(&stage.camera).map_err(|e| e.to_string())?;
+                Ok(marched(film, seconds, prepared))
             }
             Self::Reference(settings, stage) => {
                 let mut on_pass = |passes, error| done(reference::part_done(settings, passes, error));
@@ -144,4 +162,12 @@ impl Maker<'_> {
             }
         }
     }
+}
+
+/// The image of a march whose frame took `prepared` seconds to be taken up.
+fn marched(film: Film, seconds: Seconds, prepared: f64) -> Image {
+    let Seconds { source_radiance, volume_pass, view_pass } = seconds;
+    let source_radiance = source_radiance + prepared;
+    let seconds = vec![("source_radiance", source_radiance), ("volume_pass", volume_pass), ("view_pass", view_pass)];
+    Image { film, standard_error: None, seconds, figures: json!({}) }
 }

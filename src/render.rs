@@ -4,6 +4,7 @@
 //! thread or many, the bytes are the same. All settings go into each image's `smokebake:settings`.
 
 use crate::cli::{Detail, RenderArgs};
+use crate::devices::Device;
 use crate::method::{Image, Maker, Method};
 use crate::progress::Progress;
 use crate::staging::{SceneChanges, Stage};
@@ -43,6 +44,7 @@ const STEPS: u64 = 1000;
 
 /// Renders the frames, one after the other, each by all threads.
 pub fn run(args: &RenderArgs) -> Result<(), Failure> {
+    let device = Device::open(&args.device)?;
     let stage = Stage::read(&args.scene, &changes(args))?;
     let pack = Pack::open(&args.pack)?;
     let numbers: Vec<i32> = pack.frames().iter().map(|f| f.frame).collect();
@@ -58,10 +60,12 @@ pub fn run(args: &RenderArgs) -> Result<(), Failure> {
         eprintln!("smoke-bake: {said}");
     }
     let scene = &stage.scene;
+    let mut document = document(&method, args.detail, scene);
+    document["render"]["device"] = json!(device.name());
     let job = Job {
         pack: &pack,
         scene,
-        document: document(&method, args.detail, scene),
+        document,
         method,
         detail: args.detail,
         precision: if args.float { SamplePrecision::Float } else { SamplePrecision::Half },
@@ -69,7 +73,8 @@ pub fn run(args: &RenderArgs) -> Result<(), Failure> {
     let progress = Progress::start(args.progress, "rendering frames", frames.len() as u64 * STEPS);
     let start = Instant::now();
     let reports = pool.install(|| -> Result<Vec<Report>, Failure> {
-        let mut maker = method.maker(&stage).map_err(|e| Failure::work(format!("{}: {e}", args.scene.display())))?;
+        let mut maker =
+            method.maker(&stage, &device).map_err(|e| Failure::work(format!("{}: {e}", args.scene.display())))?;
         let mut reports = Vec::with_capacity(frames.len());
         for &position in &frames {
             let path = names.path(numbers[position]);

@@ -36,6 +36,18 @@ impl Sky {
         Self { visible: visible.collect(), peak: peak.map_or_else(Vec::new, |(g, order)| blurred(lights, g, order)) }
     }
 
+    /// The environments that the camera sees.
+    #[cfg(feature = "gpu")]
+    pub(crate) fn visible(&self) -> &[Environment] {
+        &self.visible
+    }
+
+    /// The peak's map, 64 across from +x over +y and 32 down from +z; empty if no peak was taken out.
+    #[cfg(feature = "gpu")]
+    pub(crate) fn peak(&self) -> &[[f32; 3]] {
+        &self.peak
+    }
+
     fn peak_at(&self, column: isize, row: isize) -> [f32; 3] {
         let row = row.clamp(0, MAP[1] as isize - 1) as usize;
         self.peak[row * MAP[0] + column.rem_euclid(MAP[0] as isize) as usize]

@@ -125,7 +125,7 @@ mod tests {
     use crate::camera::Camera;
     use crate::march::{Backdrop, Black, MarchMedium, MarchSettings, march};
     use crate::shaded_volume::ShadedVolume;
-    use glam::DVec3;
+    use glam::{DAffine3, DVec3};
 
     /// Source radiance 1 everywhere, and a box of `density` from x = 3 on in a world of 16 voxels a side.
     fn boxed(density: f32) -> ShadedVolume {
@@ -134,7 +134,7 @@ mod tests {
             .map(|[i, j, k]| [(3..15).contains(&i), (1..15).contains(&j), (1..15).contains(&k)])
             .map(|inside| [1.0, 1.0, 1.0, if inside == [true; 3] { density } else { 0.0 }])
             .collect();
-        ShadedVolume::of_nodes([16; 3], &nodes)
+        ShadedVolume::of_nodes([16; 3], &nodes, DAffine3::IDENTITY)
     }
 
     fn camera(width: usize, height: usize, fov: f64) -> Camera {

@@ -5,6 +5,8 @@ pub mod backdrop;
 pub mod camera;
 pub mod error_function;
 pub mod film;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 mod half_resolution;
 pub mod image_difference;
 pub mod lanes;

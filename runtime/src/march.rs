@@ -46,18 +46,6 @@ impl Default for MarchSettings {
 }
 
 impl ShadedVolume {
-    /// World length between samples.
-    fn sample_distance(&self, step: f32, sigma_t: [f32; 3]) -> f64 {
-        let sides = [0, 1, 2].map(|a| self.world_from_node.matrix3.col(a).length());
-        let voxel = sides.into_iter().fold(f64::INFINITY, f64::min);
-        if step > 0.0 {
-            return voxel * f64::from(step);
-        }
-        let thickest = f64::from(sigma_t.into_iter().fold(0.0, f32::max)) * f64::from(self.density_max) * voxel;
-        // No density at all divides by zero, and takes the largest step.
-        voxel * (DEPTH_PER_SAMPLE / thickest).clamp(LEAST_STEP, 1.0)
-    }
-
     /// Largest and smallest distance along a ray inside the box, or none.
     fn span(&self, origin: DVec3, direction: DVec3) -> Option<(f64, f64)> {
         let (mut near, mut far) = (0.0f64, f64::INFINITY);
@@ -75,6 +63,18 @@ impl ShadedVolume {
         }
         (near < far).then_some((near, far))
     }
+}
+
+/// World length between samples.
+pub(crate) fn sample_distance(world_from_node: &DAffine3, density_max: f32, step: f32, sigma_t: [f32; 3]) -> f64 {
+    let sides = [0, 1, 2].map(|a| world_from_node.matrix3.col(a).length());
+    let voxel = sides.into_iter().fold(f64::INFINITY, f64::min);
+    if step > 0.0 {
+        return voxel * f64::from(step);
+    }
+    let thickest = f64::from(sigma_t.into_iter().fold(0.0, f32::max)) * f64::from(density_max) * voxel;
+    // No density at all divides by zero, and takes the largest step.
+    voxel * (DEPTH_PER_SAMPLE / thickest).clamp(LEAST_STEP, 1.0)
 }
 
 /// `[J, D]` in cell `at` (its first node) of a brick, at `f` within the cell.
@@ -140,7 +140,7 @@ pub fn march(
     settings: &MarchSettings,
 ) -> Film {
     let node_from_world = volume.world_from_node.inverse();
-    let ds = volume.sample_distance(settings.step, medium.sigma_t);
+    let ds = sample_distance(&volume.world_from_node, volume.density_max, settings.step, medium.sigma_t);
     let origin = node_from_world.transform_point3(camera.position);
     let view = View { volume, camera, medium, backdrop, node_from_world, origin, ds, settings };
     if settings.half_resolution {
@@ -268,7 +268,7 @@ fn march_ray(volume: &ShadedVolume, ray: &Ray, sigma_t: [f32; 3], cutoff: f32) -
     let mut state = State { radiance: Vec4::ZERO, transmittance: Vec4::ONE, first: f64::INFINITY };
     let mut samples = Samples::default();
     let inside = ray.origin + ray.direction * (near + 1e-6 * ray.ds);
-    let mut brick = [0, 1, 2].map(|a| ((inside[a] / BRICK as f64).max(0.0) as usize).min(volume.bricks[a] - 1));
+    let mut brick = [0, 1, 2].map(|a| ((inside[a] / BRICK as f64).max(0.0) as usize).min(volume.table.bricks[a] - 1));
     // Distance at which the ray leaves its brick along each axis, and from there on from brick to brick.
     let (mut leaves, mut between) = ([f64::INFINITY; 3], [f64::INFINITY; 3]);
     for a in 0..3 {
@@ -293,7 +293,8 @@ fn march_ray(volume: &ShadedVolume, ray: &Ray, sigma_t: [f32; 3], cutoff: f32) -
         };
         let exit = leaves[axis];
         let after = number(exit.min(far)).max(next);
-        let place = volume.places[brick[0] + volume.bricks[0] * (brick[1] + volume.bricks[1] * brick[2])];
+        let place =
+            volume.table.places[brick[0] + volume.table.bricks[0] * (brick[1] + volume.table.bricks[1] * brick[2])];
         if place != EMPTY && after > next {
             let corner = DVec3::new(brick[0] as f64, brick[1] as f64, brick[2] as f64) * BRICK as f64;
             let start = (ray.origin + ray.direction * ((next + 0.5) * ray.ds) - corner).as_vec3();
@@ -306,7 +307,7 @@ fn march_ray(volume: &ShadedVolume, ray: &Ray, sigma_t: [f32; 3], cutoff: f32) -
         }
         next = after;
         brick[axis] = if ray.direction[axis] > 0.0 { brick[axis] + 1 } else { brick[axis].wrapping_sub(1) };
-        if exit >= far || brick[axis] >= volume.bricks[axis] {
+        if exit >= far || brick[axis] >= volume.table.bricks[axis] {
             state.add(volume, &mut samples, &optics);
             return state.pixel(ray);
         }
@@ -415,7 +416,7 @@ mod tests {
             let k = v / 144;
             [source, source, source, if (1..=8).contains(&k) { density } else { 0.0 }]
         });
-        let volume = ShadedVolume::of_nodes(dims, &nodes.collect::<Vec<_>>());
+        let volume = ShadedVolume::of_nodes(dims, &nodes.collect::<Vec<_>>(), DAffine3::IDENTITY);
         let camera = Camera::look_at(DVec3::new(5.5, 5.5, 60.0), DVec3::new(5.5, 5.5, 0.0), DVec3::Y, 2.0, 3, 3);
         (volume, camera)
     }
@@ -447,10 +448,10 @@ mod tests {
     fn stepping_over_empty_bricks_and_stopping_early_change_no_more_than_they_promise() {
         let (volume, camera) = slab(1.0, 1.0);
         let mut dense = slab(1.0, 1.0).0;
-        assert!(dense.places.contains(&EMPTY), "there must be something to step over");
+        assert!(dense.table.places.contains(&EMPTY), "there must be something to step over");
         let none = dense.nodes.len() as u32;
         dense.nodes.push([[1.0, 1.0, 1.0, 0.0]; BRICK_NODES]);
-        dense.places.iter_mut().filter(|p| **p == EMPTY).for_each(|p| *p = none);
+        dense.table.places.iter_mut().filter(|p| **p == EMPTY).for_each(|p| *p = none);
         let settings = MarchSettings { step: 0.5, cutoff: 0.0, ..Default::default() };
         let (a, b) = (see(&volume, &camera, [0.3; 3], &settings), see(&dense, &camera, [0.3; 3], &settings));
         assert_eq!(a.pixels, b.pixels);

@@ -10,6 +10,7 @@ use crate::camera::Camera;
 use crate::film::Film;
 use crate::light::{Beam, Light, beams};
 use crate::march::{MarchMedium, MarchSettings, march};
+use crate::medium::field::DensityField;
 use crate::medium::frame::Frame;
 use crate::shaded_volume::ShadedVolume;
 use crate::transport::compensated::centres::incident::incident;
@@ -142,7 +143,8 @@ pub struct Seconds {
 struct Loaded {
     frame: Frame,
     transport: Transport,
-    volume: ShadedVolume,
+    /// Its bricks; made for the first image.
+    volume: Option<ShadedVolume>,
 }
 
 enum Transport {
@@ -202,8 +204,7 @@ impl Renderer {
                 Transport::Transfer(Box::new(TransferTransport::new(&frame.field, transfer, settings)?))
             }
         };
-        let volume = ShadedVolume::of(&frame.field);
-        self.loaded = Some(Loaded { frame, transport, volume });
+        self.loaded = Some(Loaded { frame, transport, volume: None });
         Ok(())
     }
 
@@ -226,33 +227,54 @@ impl Renderer {
     /// The image from `camera`, and the seconds it took; an image of empty pixels before any frame.
     pub fn render(&mut self, camera: &Camera) -> Result<(Film, Seconds), RenderError> {
         let mut seconds = Seconds::default();
-        let Some(loaded) = &mut self.loaded else { return Ok((Film::new(camera.width, camera.height), seconds)) };
         let start = Instant::now();
-        let (source, medium) = match &self.source {
-            Some(source) => source,
-            None => {
-                let beams = match self.settings.route {
-                    Route::Grid(grid) => self.beams.get_or_insert_with(|| beams(&self.lights, grid.beams)).as_slice(),
-                    Route::Centres(_) | Route::Transfer(_) => &[],
-                };
-                self.source.insert(solve(loaded, &self.settings, &self.medium, &self.lights, beams)?)
-            }
+        let Some((lit, shaded)) = self.lit()? else {
+            return Ok((Film::new(camera.width, camera.height), seconds));
         };
         seconds.source_radiance = start.elapsed().as_secs_f64();
         let start = Instant::now();
-        let still_good = |eye: DVec3| eye == camera.position || !source.depends_on_view();
-        if !self.shaded.is_some_and(still_good) {
-            source.shade(&loaded.frame.field, camera.position, &mut loaded.volume);
-            self.shaded = Some(camera.position);
+        let still_good = |eye: DVec3| eye == camera.position || !lit.source.depends_on_view();
+        let volume = lit.volume.get_or_insert_with(|| ShadedVolume::of(lit.field));
+        if !shaded.is_some_and(still_good) {
+            lit.source.shade(lit.field, camera.position, volume);
+            *shaded = Some(camera.position);
         }
         seconds.volume_pass = start.elapsed().as_secs_f64();
         let start = Instant::now();
-        let peak = (medium.peak_ratio != [1.0; 3]).then_some((self.medium.g, self.settings.sh_order));
-        let sky = self.sky.get_or_insert_with(|| Sky::new(&self.lights, peak));
-        let film = march(&loaded.volume, camera, medium, sky, &self.settings.march);
+        let film = march(volume, camera, lit.medium, lit.sky, lit.march);
         seconds.view_pass = start.elapsed().as_secs_f64();
         Ok((film, seconds))
     }
+
+    /// Solves for the source radiance, if an edit has dropped it. None before any frame.
+    pub(crate) fn lit(&mut self) -> Result<Option<LitAndShaded<'_>>, RenderError> {
+        let Some(loaded) = &mut self.loaded else { return Ok(None) };
+        if self.source.is_none() {
+            let beams = match self.settings.route {
+                Route::Grid(grid) => self.beams.get_or_insert_with(|| beams(&self.lights, grid.beams)).as_slice(),
+                Route::Centres(_) | Route::Transfer(_) => &[],
+            };
+            self.source = Some(solve(loaded, &self.settings, &self.medium, &self.lights, beams)?);
+        }
+        let Some((source, medium)) = &self.source else { return Ok(None) };
+        let peak = (medium.peak_ratio != [1.0; 3]).then_some((self.medium.g, self.settings.sh_order));
+        let sky = self.sky.get_or_insert_with(|| Sky::new(&self.lights, peak));
+        let (field, volume, march) = (&loaded.frame.field, &mut loaded.volume, &self.settings.march);
+        Ok(Some((Lit { field, volume, source: source.as_ref(), medium, sky, march }, &mut self.shaded)))
+    }
+}
+
+/// What passes after the solution need, and the eye that the volume is shaded for, if it is.
+pub(crate) type LitAndShaded<'a> = (Lit<'a>, &'a mut Option<DVec3>);
+
+/// A frame under its lights.
+pub(crate) struct Lit<'a> {
+    pub(crate) field: &'a DensityField,
+    pub(crate) volume: &'a mut Option<ShadedVolume>,
+    pub(crate) source: &'a dyn SourceRadiance,
+    pub(crate) medium: &'a MarchMedium,
+    pub(crate) sky: &'a Sky,
+    pub(crate) march: &'a MarchSettings,
 }
 
 fn solve(

@@ -29,59 +29,76 @@ pub struct ShadedVolume {
     pub(crate) dims: [usize; 3],
     /// The bricks with density.
     pub(crate) nodes: Vec<Brick>,
-    /// Number of each of them among all bricks, ascending.
-    numbers: Vec<u32>,
-    /// Where in `nodes` a brick is, or [`EMPTY`]; x fastest.
-    pub(crate) places: Vec<u32>,
-    pub(crate) bricks: [usize; 3],
+    /// Where they are.
+    pub(crate) table: BrickTable,
+    /// Node to world space.
     pub(crate) world_from_node: DAffine3,
+    /// Largest density.
     pub(crate) density_max: f32,
+}
+
+/// Which bricks of a box of nodes have density.
+pub(crate) struct BrickTable {
+    /// Along x, y, z.
+    pub(crate) bricks: [usize; 3],
+    /// Numbers of the dense ones, x fastest, ascending.
+    pub(crate) dense: Vec<u32>,
+    /// Where in `dense` a brick is, or [`EMPTY`]; x fastest.
+    pub(crate) places: Vec<u32>,
+}
+
+impl BrickTable {
+    /// Those of `field`.
+    pub(crate) fn of(field: &DensityField) -> Self {
+        let bricks = field.dims.map(|n| (n - 1).div_ceil(BRICK));
+        let count: usize = bricks.iter().product();
+        let is_dense = |b: &u32| brick(field, bricks, *b).iter().any(|node| node[3] > 0.0);
+        let dense: Vec<u32> = (0..count as u32).into_par_iter().filter(is_dense).collect();
+        let mut places = vec![EMPTY; count];
+        dense.iter().enumerate().for_each(|(place, &b)| places[b as usize] = place as u32);
+        Self { bricks, dense, places }
+    }
+}
+
+/// The nodes of brick `number`, black; zeros beyond the box.
+fn brick(field: &DensityField, [bx, by, _]: [usize; 3], number: u32) -> Brick {
+    let (number, dims, mut brick) = (number as usize, field.dims, [[0.0; 4]; BRICK_NODES]);
+    let first = [number % bx, number / bx % by, number / bx / by].map(|b| b * BRICK);
+    let end = [0, 1, 2].map(|a| (first[a] + SIDE).min(dims[a]));
+    for k in first[2]..end[2] {
+        for j in first[1]..end[1] {
+            let row = &field.values[dims[0] * (j + dims[1] * k)..][first[0]..end[0]];
+            let place = SIDE * (j - first[1] + SIDE * (k - first[2]));
+            brick[place..].iter_mut().zip(row).for_each(|(node, &density)| node[3] = density);
+        }
+    }
+    brick
 }
 
 impl ShadedVolume {
     /// The bricks of a frame, black.
     pub fn of(field: &DensityField) -> Self {
-        let dims = field.dims;
-        let bricks = dims.map(|n| (n - 1).div_ceil(BRICK));
-        let count: usize = bricks.iter().product();
-        let corner =
-            |b: usize| [b % bricks[0], b / bricks[0] % bricks[1], b / bricks[0] / bricks[1]].map(|b| b * BRICK);
-        let copy = |b: usize| {
-            let (first, mut brick, mut most) = (corner(b), [[0.0; 4]; BRICK_NODES], 0.0f32);
-            for k in first[2]..(first[2] + SIDE).min(dims[2]) {
-                for j in first[1]..(first[1] + SIDE).min(dims[1]) {
-                    let row = &field.values[dims[0] * (j + dims[1] * k)..][first[0]..(first[0] + SIDE).min(dims[0])];
-                    let place = SIDE * (j - first[1] + SIDE * (k - first[2]));
-                    for (node, &density) in brick[place..].iter_mut().zip(row) {
-                        node[3] = density;
-                        most = most.max(density);
-                    }
-                }
-            }
-            (most > 0.0).then_some((b as u32, brick))
-        };
-        let (numbers, nodes): (Vec<u32>, Vec<Brick>) = (0..count).into_par_iter().filter_map(copy).unzip();
-        let mut places = vec![EMPTY; count];
-        numbers.iter().enumerate().for_each(|(place, &b)| places[b as usize] = place as u32);
+        let table = BrickTable::of(field);
+        let nodes = table.dense.par_iter().map(|&number| brick(field, table.bricks, number)).collect();
         let density_max = field.values.par_iter().copied().reduce(|| 0.0, f32::max);
-        Self { dims, nodes, numbers, places, bricks, world_from_node: field.world_from_node, density_max }
+        Self { dims: field.dims, nodes, table, world_from_node: field.world_from_node, density_max }
     }
 
     /// The first node of each brick, and how many nodes it is to the last along a side.
     pub(crate) fn corners(&self) -> (impl Iterator<Item = [usize; 3]>, usize) {
-        let [bx, by, _] = self.bricks;
+        let [bx, by, _] = self.table.bricks;
         let corner = move |b: usize| [b % bx, b / bx % by, b / bx / by].map(|b| b * BRICK);
-        (self.numbers.iter().map(move |&b| corner(b as usize)), BRICK)
+        (self.table.dense.iter().map(move |&b| corner(b as usize)), BRICK)
     }
 
     /// Writes the radiance of all nodes anew: `row(j, k, out)` gives that of the nodes `[.., j, k]` in the first three
     /// components of `out`, which come as zeros, with the density of `field`, the same as at [`Self::of`], in the fourth.
     /// It is asked for rows of bricks with density only, some of them twice.
     pub fn write(&mut self, field: &DensityField, row: impl Fn(usize, usize, &mut [[f32; 4]]) + Sync) {
-        let ([nx, ny, nz], [bx, by, _]) = (self.dims, self.bricks);
+        let ([nx, ny, nz], [bx, by, _]) = (self.dims, self.table.bricks);
         let layer = |number: u32| number as usize / (bx * by);
         let mut tasks: Vec<(&[u32], &mut [Brick])> = Vec::new();
-        let (mut numbers, mut nodes) = (&self.numbers[..], &mut self.nodes[..]);
+        let (mut numbers, mut nodes) = (&self.table.dense[..], &mut self.nodes[..]);
         while let Some(&first) = numbers.first() {
             let end = numbers.partition_point(|&n| layer(n) / LAYERS == layer(first) / LAYERS);
             let (these, rest) = std::mem::take(&mut nodes).split_at_mut(end);
@@ -123,11 +140,10 @@ impl ShadedVolume {
         });
     }
 
-    /// A volume of `nodes` (`[J red, J green, J blue, D]`, x fastest) in a world of nodes.
-    #[cfg(test)]
-    pub(crate) fn of_nodes(dims: [usize; 3], nodes: &[[f32; 4]]) -> Self {
+    /// A volume of `nodes`: `[J red, J green, J blue, D]`, x fastest, `dims` of them.
+    pub fn of_nodes(dims: [usize; 3], nodes: &[[f32; 4]], world_from_node: DAffine3) -> Self {
         let values = nodes.iter().map(|n| n[3]).collect();
-        let field = DensityField { dims, values, world_from_node: DAffine3::IDENTITY };
+        let field = DensityField { dims, values, world_from_node };
         let mut volume = Self::of(&field);
         volume.write(&field, |j, k, out| out.copy_from_slice(&nodes[dims[0] * (j + dims[1] * k)..][..dims[0]]));
         volume
@@ -152,8 +168,8 @@ mod tests {
                     assert!(out.len() == dims[0] && out.iter().all(|v| v[..3] == [0.0; 3]));
                     out.iter_mut().enumerate().for_each(|(i, o)| *o = [value(i, j, k), 1.0, 2.0, o[3]]);
                 });
-                let [bx, by, _] = volume.bricks;
-                for (b, &place) in volume.places.iter().enumerate() {
+                let [bx, by, _] = volume.table.bricks;
+                for (b, &place) in volume.table.places.iter().enumerate() {
                     let first = [b % bx, b / bx % by, b / bx / by].map(|b| b * BRICK);
                     let mut most = 0.0f32;
                     for n in 0..BRICK_NODES {

@@ -57,6 +57,8 @@ pub enum Command {
     Sweep(SweepArgs),
     /// Bake and render a small plume that comes with the program, and relight it.
     Demo(DemoArgs),
+    /// List the graphics devices that `render --device` can use.
+    Devices(DevicesArgs),
 }
 
 /// How progress is shown; `bake` and `render` take it as `--progress`.
@@ -83,6 +85,14 @@ pub type Rgb = [f64; 3];
 pub struct InspectArgs {
     /// The pack.
     pub pack: PathBuf,
+    /// Print one JSON document.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Options of `devices`.
+#[derive(Args, Debug)]
+pub struct DevicesArgs {
     /// Print one JSON document.
     #[arg(long)]
     pub json: bool,

@@ -130,6 +130,9 @@ pub struct RenderArgs {
     /// How the images are made.
     #[arg(long, value_enum, default_value_t)]
     pub method: MethodChoice,
+    /// What marches the rays: cpu, gpu for the best graphics device, or part of the name of one that `devices` lists.
+    #[arg(long, value_name = "DEVICE", default_value = "cpu")]
+    pub device: String,
     /// Error to meet, such as 5%: relative RMSE over the pixels with smoke (method auto).
     #[arg(long, value_name = "ERROR", value_parser = ratio, conflicts_with = "time")]
     pub error: Option<f64>,

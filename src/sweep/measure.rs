@@ -3,6 +3,7 @@
 use super::store::ReferenceImage;
 use super::table::{Progressed, ReferenceFigures, Seconds};
 use crate::cli::Detail;
+use crate::devices::Device;
 use crate::failure::Failure;
 use crate::method::Method;
 use crate::staging::Stage;
@@ -81,7 +82,7 @@ pub fn render(
 ) -> Result<Result<(Film, Seconds), String>, Failure> {
     let mut runs: Vec<(Seconds, Film)> = Vec::new();
     for _ in 0..repeat.max(1) {
-        let mut maker = match method.maker(stage) {
+        let mut maker = match method.maker(stage, &Device::Cpu) {
             Ok(maker) => maker,
             Err(why) => return Ok(Err(why)),
         };

@@ -13,8 +13,8 @@ use std::ffi::OsString;
 use std::path::Path;
 
 /// Options of `render` that a sweep sets itself, or that change nothing in the picture.
-const NO_RENDER_DIALS: [&str; 11] =
-    ["scene", "output", "frames", "width", "height", "sigma-t", "albedo", "g", "float", "progress", "json"];
+const NO_RENDER_DIALS: [&str; 12] =
+    ["scene", "output", "frames", "width", "height", "sigma-t", "albedo", "g", "float", "device", "progress", "json"];
 
 /// Options of `bake` that a sweep sets itself, or that change nothing in the pack. Its threads are those of `render`.
 const NO_BAKE_DIALS: [&str; 7] = ["output", "frames", "resume", "dry-run", "threads", "progress", "json"];

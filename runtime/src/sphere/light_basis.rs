@@ -54,13 +54,13 @@ impl BasisKind {
         false
     }
 
-    /// The same on a mesh of edges twice as long, down to 42 nodes; harmonics as they are. Light that was scattered is as
-    /// smooth in the light's direction as the phase function and the smoke make it: half the nodes a side are enough.
+    /// Hats on a mesh of edges twice as long, down to 42 nodes; harmonics as they are. Light that was scattered is as smooth
+    /// in the light's direction as the phase function and the smoke make it: half the nodes a side are enough, and hats,
+    /// which keep linear functions, meet it better than the discrete function, with three in place of six a direction.
     pub fn coarser(self) -> Self {
         let fewer = |nodes: usize| ((nodes - 2) / 4 + 2).max(42);
         match self {
-            Self::Discrete(nodes) => Self::Discrete(fewer(nodes)),
-            Self::Hat(nodes) => Self::Hat(fewer(nodes)),
+            Self::Discrete(nodes) | Self::Hat(nodes) => Self::Hat(fewer(nodes)),
             Self::Harmonics(order) => Self::Harmonics(order),
         }
     }

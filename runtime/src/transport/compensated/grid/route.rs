@@ -209,7 +209,20 @@ fn multiple_layer(
     (Layer { planes: planes.collect(), ..first }, solved.iterations, solved.residual)
 }
 
+impl GridSource {
+    /// Spacing in voxels, nodes along x, y, z, and planes `[coefficient * channels + channel][node]` of each layer, single
+    /// scattering first.
+    pub fn layers(&self) -> impl Iterator<Item = (usize, [usize; 3], &[Vec<f32>])> {
+        let layers = std::iter::once(&self.single).chain(&self.multiple);
+        layers.map(|layer| (layer.step, layer.dims, layer.planes.as_slice()))
+    }
+}
+
 impl SourceRadiance for GridSource {
+    fn as_grid(&self) -> Option<&GridSource> {
+        Some(self)
+    }
+
     fn depends_on_view(&self) -> bool {
         self.single.planes.len() > self.channels
     }

@@ -1,0 +1,232 @@
+//! What both sides read: structures of bytes in the layout of WGSL, each with the name that it has in its shader.
+//!
+//! Three-vectors are padded to four, so that nothing is aligned differently here and there; a test parses the shaders
+//! and compares the size and the offset of every member.
+
+use bytemuck::{Pod, Zeroable};
+
+/// Declares a structure for both sides, and its members for the test.
+macro_rules! layout {
+    ($(#[$doc:meta])* $name:ident { $($(#[$member_doc:meta])* $member:ident: $kind:ty,)* }) => {
+        $(#[$doc])*
+        #[repr(C)]
+        #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+        pub struct $name { $($(#[$member_doc])* pub $member: $kind,)* }
+
+        impl $name {
+            /// Name, offset and size of each member, bytes.
+            pub const MEMBERS: &[(&str, usize, usize)] =
+                &[$((stringify!($member), std::mem::offset_of!($name, $member), size_of::<$kind>()),)*];
+        }
+    };
+}
+
+layout! {
+    /// The view pass: members as `march.wgsl` describes them.
+    March {
+        /// The axis's crossing of the plane through the middle of the box, node space.
+        centre: [f32; 4],
+        /// Across by one pixel there, node space.
+        plane_right: [f32; 4],
+        /// Down by one pixel there, node space.
+        plane_down: [f32; 4],
+        /// Along the axis by one sample, node space.
+        step_forward: [f32; 4],
+        /// What one pixel across adds to it.
+        step_right: [f32; 4],
+        /// What one pixel down adds to it.
+        step_down: [f32; 4],
+        /// The axis, world space, a unit vector.
+        forward: [f32; 4],
+        /// What one pixel across adds to it.
+        right: [f32; 4],
+        /// What one pixel down adds to it.
+        down: [f32; 4],
+        /// Extinction of the march, per unit density and world length.
+        sigma_t: [f32; 4],
+        /// The user's extinction over that.
+        peak_ratio: [f32; 4],
+        /// Last node along each axis.
+        top: [f32; 4],
+        /// Bricks along each axis.
+        bricks: [u32; 4],
+        /// Pixels across and down.
+        size: [u32; 2],
+        /// First pixel of the dispatch.
+        first_pixel: u32,
+        /// Pixels of the dispatch.
+        pixels: u32,
+        /// Rays along a side of a pixel.
+        samples: u32,
+        /// Bricks of a page of nodes.
+        bricks_a_page: u32,
+        /// Visible environments.
+        environments: u32,
+        /// 1 where a forward peak counts as not scattered.
+        has_peak: u32,
+        /// Tangent of a pixel.
+        pixel: f32,
+        /// World length between samples.
+        ds: f32,
+        /// Distance of the plane along the axis, world length.
+        plane: f32,
+        /// Its fraction in samples.
+        plane_fraction: f32,
+        /// It in samples.
+        plane_samples: f32,
+        /// Number of the eye's first sample, counted from the plane.
+        least: i32,
+        /// Transmittance at which a ray ends.
+        cutoff: f32,
+        /// Nothing.
+        pad: f32,
+    }
+}
+
+layout! {
+    /// What the view pass leaves in a pixel.
+    Pixel {
+        /// Radiance and depth; 3e38 where there is no density.
+        radiance: [f32; 4],
+        /// Transmittance; the fourth is nothing.
+        transmittance: [f32; 4],
+    }
+}
+
+layout! {
+    /// A visible environment.
+    Environment {
+        /// Texels across and down.
+        size: [u32; 2],
+        /// Its first texel.
+        first: u32,
+        /// 1 if y is up.
+        up_is_y: u32,
+        /// Radians.
+        rotation: f32,
+        /// Nothing.
+        pad_0: f32,
+        /// Nothing.
+        pad_1: f32,
+        /// Nothing.
+        pad_2: f32,
+    }
+}
+
+layout! {
+    /// The volume pass: members as `route.wgsl` describes them.
+    VolumePass {
+        /// The eye, node space.
+        eye: [f32; 4],
+        /// First column of the map to the world, scaled.
+        column_x: [f32; 4],
+        /// Second.
+        column_y: [f32; 4],
+        /// Third.
+        column_z: [f32; 4],
+        /// Nodes of the field.
+        dims: [u32; 4],
+        /// Nodes of the layer.
+        layer_dims: [u32; 4],
+        /// Bricks along each axis.
+        bricks: [u32; 4],
+        /// Spacing of the layer, in nodes of the field.
+        step: u32,
+        /// 1 or 3.
+        channels: u32,
+        /// Number of the dispatch's first plane.
+        first_plane: u32,
+        /// Planes of the dispatch.
+        planes: u32,
+        /// Bands of the layer.
+        bands: u32,
+        /// First brick of the page.
+        first_brick: u32,
+        /// Bricks of the page.
+        page_bricks: u32,
+        /// Nothing.
+        pad: u32,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::pass::PRELUDE;
+    use crate::gpu::{march, volume_pass};
+    use naga::TypeInner;
+
+    const SHADERS: [(&str, &str); 2] = [("march.wgsl", march::SHADER), ("route.wgsl", volume_pass::SHADER)];
+    type Members = &'static [(&'static str, usize, usize)];
+    /// Every structure of every shader.
+    const LAYOUTS: [(&str, usize, Members); 4] = [
+        ("March", size_of::<March>(), March::MEMBERS),
+        ("Pixel", size_of::<Pixel>(), Pixel::MEMBERS),
+        ("Environment", size_of::<Environment>(), Environment::MEMBERS),
+        ("VolumePass", size_of::<VolumePass>(), VolumePass::MEMBERS),
+    ];
+
+    fn parse(name: &str, text: &str) -> naga::Module {
+        let text = format!("{PRELUDE}{text}");
+        naga::front::wgsl::parse_str(&text).unwrap_or_else(|e| panic!("{name}: {}", e.emit_to_string(&text)))
+    }
+
+    /// The first structure that differs from its twin, and how many were compared.
+    fn compare(module: &naga::Module) -> Result<usize, String> {
+        let mut layouter = naga::proc::Layouter::default();
+        layouter.update(module.to_ctx()).map_err(|e| e.to_string())?;
+        let mut compared = 0;
+        for (_, kind) in module.types.iter() {
+            let (TypeInner::Struct { members, span }, Some(name)) = (&kind.inner, &kind.name) else { continue };
+            let Some((_, size, ours)) = LAYOUTS.iter().find(|(n, ..)| n == name) else {
+                return Err(format!("{name} has no twin"));
+            };
+            let theirs: Vec<(&str, usize, usize)> = members
+                .iter()
+                .map(|m| (m.name.as_deref().unwrap_or(""), m.offset as usize, layouter[m.ty].size as usize))
+                .collect();
+            if *span as usize != *size || theirs != *ours {
+                return Err(format!("{name}: {span} {theirs:?}, expected {size} {ours:?}"));
+            }
+            compared += 1;
+        }
+        Ok(compared)
+    }
+
+    #[test]
+    fn every_structure_has_the_same_size_and_offsets_on_both_sides() {
+        let compared: usize = SHADERS.iter().map(|(name, text)| compare(&parse(name, text)).unwrap()).sum();
+        assert_eq!(compared, LAYOUTS.len());
+    }
+
+    #[test]
+    fn a_member_that_is_moved_renamed_or_missing_is_found() {
+        for (from, to) in [
+            ("    least: i32,\n    cutoff: f32,", "    cutoff: f32,\n    least: i32,"),
+            ("    pixel: f32,", "    texel: f32,"),
+            ("    peak_ratio: vec4<f32>,", ""),
+            ("    up_is_y: u32,", "    up_is_y: vec2<u32>,"),
+        ] {
+            assert!(march::SHADER.contains(from));
+            // Parsed only: what reads the member is of no interest.
+            let structures: String = march::SHADER.replace(from, to);
+            let end = structures.find("@group").unwrap();
+            assert!(compare(&parse("changed", &structures[..end])).is_err(), "{from}");
+        }
+    }
+
+    #[test]
+    fn shaders_are_valid_without_any_capability() {
+        for (name, text) in SHADERS {
+            let module = parse(name, text);
+            let flags = naga::valid::ValidationFlags::all();
+            naga::valid::Validator::new(flags, naga::valid::Capabilities::empty())
+                .validate(&module)
+                .unwrap_or_else(|e| panic!("{name}: {}", e.emit_to_string(&format!("{PRELUDE}{text}"))));
+            assert!(!module.entry_points.is_empty());
+            let storage = |v: &naga::GlobalVariable| matches!(v.space, naga::AddressSpace::Storage { .. });
+            let count = module.global_variables.iter().filter(|(_, v)| storage(v)).count();
+            assert!(count <= 8, "{name}: {count} storage buffers, of which a stage has 8");
+        }
+    }
+}

@@ -1,0 +1,163 @@
+//! The host's side of the view pass, `march.wgsl`: a film from a volume on the device.
+//!
+//! What differs from the processor: places are f32 (see the shader), azimuths of environments are as exact as the
+//! device's `atan2` (Vulkan allows 4,096 units in the last place, 2e-4 of a turn), and only whole resolution is served.
+//! Pixels are done in runs of at most 2^20 rays, so that no submission takes so long that a driver gives up on it.
+
+use super::device::{Gpu, GpuError};
+use super::layouts::{Environment, March, Pixel as DevicePixel};
+use super::pass::{Kernel, Step};
+use super::volume::DeviceVolume;
+use crate::backdrop::Sky;
+use crate::camera::Camera;
+use crate::film::{Film, Pixel};
+use crate::march::{MarchMedium, MarchSettings, sample_distance};
+use glam::DVec3;
+
+/// The shader, without its prelude.
+pub const SHADER: &str = include_str!("../march.wgsl");
+/// Rays of one submission.
+const RAYS: usize = 1 << 20;
+/// What the shader writes for infinity, which WGSL has no word for.
+const FAR: f32 = 3.0e38;
+
+/// The view pass, compiled.
+pub struct MarchPass {
+    kernel: Kernel,
+}
+
+/// A [`Sky`] on the device.
+pub struct DeviceSky {
+    count: u32,
+    has_peak: bool,
+    environments: wgpu::Buffer,
+    texels: wgpu::Buffer,
+}
+
+impl DeviceSky {
+    /// A copy of `sky`.
+    pub fn new(gpu: &Gpu, sky: &Sky) -> Result<Self, GpuError> {
+        let four = |v: &[f32; 3]| [v[0], v[1], v[2], 0.0];
+        let mut texels: Vec<[f32; 4]> = sky.peak().iter().map(four).collect();
+        let mut environments = Vec::new();
+        for environment in sky.visible() {
+            environments.push(Environment {
+                size: [environment.width as u32, environment.height as u32],
+                first: texels.len() as u32,
+                up_is_y: environment.up_is_y.into(),
+                rotation: environment.rotation as f32,
+                ..Environment::default()
+            });
+            texels.extend(environment.radiance.iter().map(four));
+        }
+        gpu.checked("backdrop", || {
+            Ok(Self {
+                count: environments.len() as u32,
+                has_peak: !sky.peak().is_empty(),
+                environments: gpu.upload("visible environments", &environments)?,
+                texels: gpu.upload("texels of the visible environments", &texels)?,
+            })
+        })
+    }
+}
+
+impl MarchPass {
+    /// Compiles the shader.
+    pub fn new(gpu: &Gpu) -> Result<Self, GpuError> {
+        Self::from_source(gpu, SHADER)
+    }
+
+    /// From another text of the same bindings: how a planted difference is shown to be found.
+    pub fn from_source(gpu: &Gpu, source: &str) -> Result<Self, GpuError> {
+        Ok(Self { kernel: Kernel::new(gpu, "march", source, "march_pixels")? })
+    }
+
+    /// Marches every pixel; and the microseconds on the device, where it can tell.
+    pub fn film(
+        &self,
+        gpu: &Gpu,
+        volume: &DeviceVolume,
+        camera: &Camera,
+        medium: &MarchMedium,
+        sky: &DeviceSky,
+        settings: &MarchSettings,
+    ) -> Result<(Film, Option<f64>), GpuError> {
+        let mut film = Film::new(camera.width, camera.height);
+        let most = (gpu.summary().storage_binding.min(gpu.summary().buffer) as usize / size_of::<DevicePixel>()).max(1);
+        let run = (RAYS / (settings.samples * settings.samples)).clamp(1, most).min(film.pixels.len().max(1));
+        let out = gpu.storage("pixels of the image", (run * size_of::<DevicePixel>()) as u64)?;
+        let all = placed(volume, camera, medium, sky, settings);
+        let mut microseconds = Some(0.0);
+        for (number, pixels) in film.pixels.chunks_mut(run).enumerate() {
+            let uniform = March { first_pixel: (number * run) as u32, pixels: pixels.len() as u32, ..all };
+            let uniform = gpu.uniform("march", &uniform);
+            let [a, b, c, d] = [0, 1, 2, 3].map(|page| &volume.pages[page]);
+            let inputs = [&uniform, &volume.places, a, b, c, d, &sky.environments, &sky.texels, &out];
+            let buffers: Vec<(u32, &wgpu::Buffer)> = (0..).zip(inputs).collect();
+            let step = Step { kernel: &self.kernel, buffers: &buffers, threads: pixels.len() as u32 };
+            let took = gpu.dispatch("view pass", &[step])?;
+            microseconds = microseconds.zip(took).map(|(sum, took)| sum + took);
+            let marched: Vec<DevicePixel> = gpu.read("view pass", &out, pixels.len())?;
+            for (pixel, DevicePixel { radiance: [r, g, b, depth], transmittance: [x, y, z, _] }) in
+                pixels.iter_mut().zip(marched)
+            {
+                let depth = if depth < FAR { depth } else { f32::INFINITY };
+                *pixel = Pixel { radiance: [r, g, b], transmittance: [x, y, z], depth };
+            }
+        }
+        Ok((film, microseconds))
+    }
+}
+
+/// Everything but the pixels of a dispatch. All differences of large numbers are taken here, in f64.
+fn placed(
+    volume: &DeviceVolume,
+    camera: &Camera,
+    medium: &MarchMedium,
+    sky: &DeviceSky,
+    settings: &MarchSettings,
+) -> March {
+    let node_from_world = volume.world_from_node.inverse();
+    let ds = sample_distance(&volume.world_from_node, volume.density_max, settings.step, medium.sigma_t);
+    let top = volume.dims.map(|n| (n - 1) as f64);
+    let middle = volume.world_from_node.transform_point3(DVec3::from_array(top) * 0.5);
+    // An eye past the middle counts from itself.
+    let plane = (middle - camera.position).dot(camera.forward).max(0.0);
+    let samples = (plane / ds).min(f64::from(1 << 30));
+    let whole = samples.floor();
+    let pixel = 2.0 * camera.tan_half_width / camera.width as f64;
+    let (right, down) = (camera.right * pixel, -camera.up * pixel);
+    let four = |v: DVec3| v.as_vec3().extend(0.0).to_array();
+    let node = |v: DVec3| four(node_from_world.transform_vector3(v));
+    let wide = |v: [f32; 3], last: f32| [v[0], v[1], v[2], last];
+    March {
+        centre: four(node_from_world.transform_point3(camera.position + camera.forward * plane)),
+        plane_right: node(right * plane),
+        plane_down: node(down * plane),
+        step_forward: node(camera.forward * ds),
+        step_right: node(right * ds),
+        step_down: node(down * ds),
+        forward: four(camera.forward),
+        right: four(right),
+        down: four(down),
+        sigma_t: wide(medium.sigma_t, 0.0),
+        peak_ratio: wide(medium.peak_ratio, 1.0),
+        top: wide(top.map(|t| t as f32), 0.0),
+        bricks: [volume.bricks[0] as u32, volume.bricks[1] as u32, volume.bricks[2] as u32, 0],
+        size: [camera.width as u32, camera.height as u32],
+        first_pixel: 0,
+        pixels: 0,
+        samples: settings.samples as u32,
+        bricks_a_page: volume.bricks_a_page.min(u32::MAX as usize) as u32,
+        environments: sky.count,
+        has_peak: (sky.has_peak && medium.peak_ratio != [1.0; 3]).into(),
+        pixel: pixel as f32,
+        ds: ds as f32,
+        plane: plane as f32,
+        plane_fraction: (samples - whole) as f32,
+        plane_samples: samples as f32,
+        least: -(whole as i32),
+        cutoff: settings.cutoff,
+        pad: 0.0,
+    }
+}

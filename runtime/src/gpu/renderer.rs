@@ -1,0 +1,142 @@
+//! The calls of [`Renderer`], with the volume pass of the grid route and the view pass on a device.
+//!
+//! Decoding, sweeps and the iteration for multiple scattering are the processor's, and so is the volume pass of other
+//! routes: their results are copied. Kept until an edit makes them void: planes, bricks and backdrop on the device.
+
+use super::device::{Gpu, GpuError};
+use super::march::{DeviceSky, MarchPass};
+use super::self_test;
+use super::volume::DeviceVolume;
+use super::volume_pass::{DeviceSource, VolumePass};
+use crate::camera::Camera;
+use crate::film::Film;
+use crate::light::Light;
+use crate::medium::frame::Frame;
+use crate::renderer::{Lit, RenderError, RenderSettings, Renderer, Seconds};
+use crate::shaded_volume::ShadedVolume;
+use crate::transport::medium::MediumParameters;
+use glam::DVec3;
+use std::sync::Arc;
+use std::time::Instant;
+
+/// Why the device makes no image.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum GpuRenderError {
+    /// The input is at fault, on any device.
+    #[error(transparent)]
+    Render(#[from] RenderError),
+    /// The device is.
+    #[error(transparent)]
+    Gpu(#[from] GpuError),
+}
+
+/// What depends on the frame alone.
+struct Loaded {
+    volume: DeviceVolume,
+    density: wgpu::Buffer,
+}
+
+/// See the module's head.
+pub struct GpuRenderer {
+    gpu: Arc<Gpu>,
+    /// Checks, solves, and keeps what is the processor's.
+    solver: Renderer,
+    march: MarchPass,
+    volume_pass: VolumePass,
+    sky: Option<DeviceSky>,
+    source: Option<DeviceSource>,
+    loaded: Option<Loaded>,
+    /// The eye that the volume is shaded for.
+    eye: Option<DVec3>,
+}
+
+impl GpuRenderer {
+    /// Checks settings and medium, compiles, and tests the device against the processor.
+    pub fn new(
+        gpu: Arc<Gpu>,
+        settings: RenderSettings,
+        medium: MediumParameters,
+        lights: Vec<Light>,
+    ) -> Result<Self, GpuRenderError> {
+        let solver = Renderer::new(settings, medium, lights)?;
+        if settings.march.half_resolution {
+            let name = "half resolution";
+            return Err(GpuError::Setting { name, found: "true", expected: "false" }.into());
+        }
+        let (march, volume_pass) = (MarchPass::new(&gpu)?, VolumePass::new(&gpu)?);
+        self_test::check(&gpu, &march)?;
+        let (sky, source, loaded, eye) = (None, None, None, None);
+        Ok(Self { gpu, solver, march, volume_pass, sky, source, loaded, eye })
+    }
+
+    /// The device.
+    pub fn gpu(&self) -> &Arc<Gpu> {
+        &self.gpu
+    }
+
+    /// Another frame.
+    pub fn set_frame(&mut self, frame: Frame) -> Result<(), RenderError> {
+        (self.source, self.loaded, self.eye) = (None, None, None);
+        self.solver.set_frame(frame)
+    }
+
+    /// Other lights.
+    pub fn set_lights(&mut self, lights: Vec<Light>) -> Result<(), RenderError> {
+        (self.sky, self.source, self.eye) = (None, None, None);
+        self.solver.set_lights(lights)
+    }
+
+    /// Another medium.
+    pub fn set_medium(&mut self, medium: MediumParameters) -> Result<(), RenderError> {
+        (self.sky, self.source, self.eye) = (None, None, None);
+        self.solver.set_medium(medium)
+    }
+
+    /// The image from `camera`, and the seconds it took, copies included; empty pixels before any frame.
+    pub fn render(&mut self, camera: &Camera) -> Result<(Film, Seconds), GpuRenderError> {
+        let mut seconds = Seconds::default();
+        let start = Instant::now();
+        let Some((lit, _)) = self.solver.lit()? else {
+            return Ok((Film::new(camera.width, camera.height), seconds));
+        };
+        let Lit { field, volume: shaded, source, medium, sky, march } = lit;
+        let gpu = &*self.gpu;
+        if let (None, Some(grid)) = (&self.source, source.as_grid()) {
+            self.source = Some(DeviceSource::new(gpu, grid)?);
+        }
+        seconds.source_radiance = start.elapsed().as_secs_f64();
+        let start = Instant::now();
+        let eye = self.eye.take().filter(|&eye| eye == camera.position || !source.depends_on_view());
+        let loaded = match (self.loaded.take(), &self.source) {
+            // A frame's bricks are the same under any light; others' volumes come whole from the processor.
+            (Some(loaded), Some(_)) => loaded,
+            (Some(loaded), None) if eye.is_some() => loaded,
+            (_, Some(_)) => Loaded {
+                volume: DeviceVolume::of_field(gpu, field)?,
+                density: gpu.upload("density of the frame", &field.values)?,
+            },
+            (_, None) => {
+                let shaded = shaded.get_or_insert_with(|| ShadedVolume::of(field));
+                source.shade(field, camera.position, shaded);
+                let density = gpu.upload::<f32>("density of the frame", &[])?;
+                Loaded { volume: DeviceVolume::of_shaded(gpu, shaded)?, density }
+            }
+        };
+        let loaded = self.loaded.insert(loaded);
+        if let (None, Some(source)) = (eye, &self.source) {
+            self.volume_pass.shade(gpu, source, (field, &loaded.density), &loaded.volume, camera.position)?;
+        }
+        self.eye = Some(eye.unwrap_or(camera.position));
+        seconds.volume_pass = start.elapsed().as_secs_f64();
+        let start = Instant::now();
+        if self.sky.is_none() {
+            self.sky = Some(DeviceSky::new(gpu, sky)?);
+        }
+        let film = match &self.sky {
+            Some(sky) => self.march.film(gpu, &loaded.volume, camera, medium, sky, march)?.0,
+            None => Film::new(camera.width, camera.height),
+        };
+        seconds.view_pass = start.elapsed().as_secs_f64();
+        Ok((film, seconds))
+    }
+}

@@ -1,0 +1,138 @@
+//! The host's side of the volume pass, `transport/compensated/grid/route.wgsl`.
+//!
+//! Planes go to the device as many at a time as a shader may see of a buffer, and stay there until the light changes.
+
+use super::device::{Gpu, GpuError};
+use super::layouts::VolumePass as Uniform;
+use super::pass::{Kernel, Step};
+use super::volume::{DeviceVolume, PAGES};
+use crate::medium::field::DensityField;
+use crate::shaded_volume::BRICK_NODES;
+use crate::transport::compensated::grid::route::GridSource;
+use glam::DVec3;
+
+/// The shader, without its prelude.
+pub const SHADER: &str = include_str!("../transport/compensated/grid/route.wgsl");
+
+/// The volume pass, compiled.
+pub struct VolumePass {
+    add: Kernel,
+    finish: Kernel,
+}
+
+/// Planes of a layer, some to a buffer.
+struct DeviceLayer {
+    step: usize,
+    dims: [usize; 3],
+    bands: usize,
+    /// Number of the first plane, how many, and they.
+    parts: Vec<(usize, usize, wgpu::Buffer)>,
+}
+
+/// A [`GridSource`] on the device.
+pub struct DeviceSource {
+    channels: usize,
+    layers: Vec<DeviceLayer>,
+}
+
+impl DeviceSource {
+    /// A copy of `source`.
+    pub fn new(gpu: &Gpu, source: &GridSource) -> Result<Self, GpuError> {
+        let limit = gpu.summary().storage_binding.min(gpu.summary().buffer);
+        let layer = |(step, dims, planes): (usize, [usize; 3], &[Vec<f32>])| {
+            let bytes = 4 * dims.iter().product::<usize>() as u64;
+            let each = ((limit / bytes.max(1)) as usize).max(1);
+            let bands = (planes.len() / source.channels).isqrt();
+            let parts = planes.chunks(each).enumerate();
+            let parts = parts.map(|(part, planes)| {
+                Ok((part * each, planes.len(), gpu.upload("planes of source radiance", &planes.concat())?))
+            });
+            Ok(DeviceLayer { step, dims, bands, parts: parts.collect::<Result<_, GpuError>>()? })
+        };
+        let layers =
+            gpu.checked("source radiance", || source.layers().map(layer).collect::<Result<Vec<_>, GpuError>>())?;
+        Ok(Self { channels: source.channels, layers })
+    }
+}
+
+impl VolumePass {
+    /// Compiles the shader.
+    pub fn new(gpu: &Gpu) -> Result<Self, GpuError> {
+        Self::from_source(gpu, SHADER)
+    }
+
+    /// From another text of the same bindings: how a planted difference is shown to be found.
+    pub fn from_source(gpu: &Gpu, source: &str) -> Result<Self, GpuError> {
+        let add = Kernel::new(gpu, "volume pass", source, "add_planes")?;
+        Ok(Self { add, finish: Kernel::new(gpu, "volume pass", source, "finish")? })
+    }
+
+    /// Shades `volume`, which was made of `field`, for an eye in world space; microseconds where the device can tell.
+    /// `density` is the field's, one value a node.
+    pub fn shade(
+        &self,
+        gpu: &Gpu,
+        source: &DeviceSource,
+        (field, density): (&DensityField, &wgpu::Buffer),
+        volume: &DeviceVolume,
+        eye: DVec3,
+    ) -> Result<Option<f64>, GpuError> {
+        let linear = field.world_from_node.matrix3;
+        let largest = linear.to_cols_array().into_iter().fold(0.0f64, |m, v| m.max(v.abs()));
+        let four = |v: DVec3| v.as_vec3().extend(0.0).to_array();
+        let wide = |v: [usize; 3]| [v[0] as u32, v[1] as u32, v[2] as u32, 0];
+        let base = Uniform {
+            eye: four(field.world_from_node.inverse().transform_point3(eye)),
+            column_x: four(linear.x_axis / largest),
+            column_y: four(linear.y_axis / largest),
+            column_z: four(linear.z_axis / largest),
+            dims: wide(field.dims),
+            bricks: wide(volume.bricks),
+            channels: source.channels as u32,
+            ..Uniform::default()
+        };
+        // Uniforms first: steps borrow them.
+        let mut uniforms = Vec::new();
+        for page in (0..PAGES).filter(|&page| volume.page(page).1 > 0) {
+            let (first_brick, bricks) = volume.page(page);
+            let base = Uniform { first_brick: first_brick as u32, page_bricks: bricks as u32, ..base };
+            for layer in &source.layers {
+                for (first, count, buffer) in &layer.parts {
+                    let uniform = Uniform {
+                        layer_dims: wide(layer.dims),
+                        step: layer.step as u32,
+                        first_plane: *first as u32,
+                        planes: *count as u32,
+                        bands: layer.bands as u32,
+                        ..base
+                    };
+                    uniforms.push((page, Some(buffer), gpu.uniform("volume pass", &uniform)));
+                }
+            }
+            uniforms.push((page, None, gpu.uniform("volume pass", &base)));
+        }
+        let buffers: Vec<Vec<(u32, &wgpu::Buffer)>> = uniforms
+            .iter()
+            .map(|(page, planes, uniform)| {
+                let own = if let Some(planes) = planes { (2, *planes) } else { (3, density) };
+                vec![(0, uniform), (1, &volume.dense_bricks), own, (4, &volume.pages[*page])]
+            })
+            .collect();
+        let steps: Vec<Step> = uniforms
+            .iter()
+            .zip(&buffers)
+            .map(|((page, planes, _), buffers)| Step {
+                kernel: if planes.is_some() { &self.add } else { &self.finish },
+                buffers,
+                threads: (volume.page(*page).1 * BRICK_NODES) as u32,
+            })
+            .collect();
+        gpu.checked("volume pass", || {
+            let mut encoder = gpu.device.create_command_encoder(&Default::default());
+            volume.pages.iter().for_each(|page| encoder.clear_buffer(page, 0, None));
+            gpu.queue.submit([encoder.finish()]);
+            Ok(())
+        })?;
+        gpu.dispatch("volume pass", &steps)
+    }
+}

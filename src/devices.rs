@@ -1,0 +1,93 @@
+//! `smoke-bake devices`, and the device that `--device` means.
+
+#[cfg(feature = "gpu")]
+use crate::answer;
+use crate::cli::DevicesArgs;
+use crate::failure::Failure;
+#[cfg(feature = "gpu")]
+use smoke_runtime::gpu::device::{Choice, ForcedLimits, Gpu, adapters};
+#[cfg(feature = "gpu")]
+use std::sync::Arc;
+
+/// What marches.
+pub enum Device {
+    /// The processor.
+    Cpu,
+    /// An open graphics device.
+    #[cfg(feature = "gpu")]
+    Gpu(Arc<Gpu>),
+}
+
+#[cfg(not(feature = "gpu"))]
+const WITHOUT: &str =
+    "this program was built without graphics devices; build it with --features gpu, or use --device cpu";
+
+impl Device {
+    /// `cpu`, `gpu`, or part of an adapter's name.
+    pub fn open(name: &str) -> Result<Self, Failure> {
+        match name {
+            "cpu" => Ok(Self::Cpu),
+            other => Self::open_graphics(other),
+        }
+    }
+
+    #[cfg(feature = "gpu")]
+    fn open_graphics(name: &str) -> Result<Self, Failure> {
+        let choice = if name == "gpu" { Choice::Best } else { Choice::Named(name.to_owned()) };
+        let gpu = Gpu::open(&choice, ForcedLimits::default());
+        gpu.map(|gpu| Self::Gpu(Arc::new(gpu))).map_err(|e| Failure::work(e.to_string()))
+    }
+
+    #[cfg(not(feature = "gpu"))]
+    fn open_graphics(_: &str) -> Result<Self, Failure> {
+        Err(Failure::work(WITHOUT))
+    }
+
+    /// As an image's metadata has it: `cpu`, or the adapter's name.
+    pub fn name(&self) -> &str {
+        match self {
+            Self::Cpu => "cpu",
+            #[cfg(feature = "gpu")]
+            Self::Gpu(gpu) => &gpu.summary().name,
+        }
+    }
+}
+
+/// Lists them, the one that `--device gpu` means first.
+#[cfg(feature = "gpu")]
+pub fn run(args: &DevicesArgs) -> Result<(), Failure> {
+    let adapters = adapters();
+    if args.json {
+        let rows = adapters.iter().map(|a| {
+            serde_json::json!({
+                "name": a.name, "backend": a.backend, "kind": a.kind, "driver": a.driver,
+                "storage_binding_bytes": a.storage_binding, "buffer_bytes": a.buffer, "timestamps": a.timestamps,
+            })
+        });
+        return answer::json(&rows.collect::<Vec<_>>());
+    }
+    let line = |a: &smoke_runtime::gpu::device::AdapterSummary| {
+        let mebibytes = a.storage_binding >> 20;
+        format!("{}  ({}, {}, {}; {mebibytes} MiB a binding)\n", a.name, a.kind, a.backend, a.driver)
+    };
+    let lines: String = adapters.iter().map(line).collect();
+    answer::text(if lines.is_empty() { "no graphics device; --device cpu is what there is\n" } else { &lines })
+}
+
+/// Says that there are none in this build.
+#[cfg(not(feature = "gpu"))]
+pub fn run(_: &DevicesArgs) -> Result<(), Failure> {
+    Err(Failure::work(WITHOUT))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_processor_is_always_there_and_what_is_not_there_is_refused_in_one_line_that_says_what_to_do() {
+        assert_eq!(Device::open("cpu").unwrap().name(), "cpu");
+        let Err(Failure::Work(message)) = Device::open("no such device") else { panic!("it was opened") };
+        assert!(message.contains("--device cpu") && !message.contains('\n'), "{message}");
+    }
+}
