@@ -121,9 +121,13 @@ pub fn run(args: &ViewArgs) -> Result<(), Failure> {
     let options = eframe::NativeOptions { viewport, ..Default::default() };
     let create: eframe::AppCreator<'_> = Box::new(|cc| Ok(Box::new(App::new(cc, args, opened, skies, shot))));
     eframe::run_native("smoke-bake", options, create).map_err(|e| {
-        let need = "view needs a display (X11 or Wayland) and a graphics driver (Vulkan, Metal or Direct3D 12); \
-                    without them, use render";
-        Failure::work(format!("the window cannot be opened: {e}; {need}"))
+        let (missing, why) = match e {
+            // Its text names a line of the source.
+            eframe::Error::WinitEventLoop(_) => ("a display (DISPLAY or WAYLAND_DISPLAY)", String::new()),
+            eframe::Error::Wgpu(e) => ("a graphics driver (Vulkan, Metal or Direct3D 12)", format!(": {e}")),
+            e => ("a display and a graphics driver", format!(": {e}")),
+        };
+        Failure::work(format!("view needs {missing} and cannot open its window{why}; without one, use render"))
     })?;
     match outcome.lock().unwrap_or_else(PoisonError::into_inner).take() {
         Some(outcome) => outcome.map_err(Failure::work),
@@ -308,7 +312,10 @@ impl App {
 
     fn show(&mut self, picture: Picture, full: bool) {
         let Picture { serial, film, passes, of, stages } = picture;
-        if full && let Some((asked, solved)) = &self.solving && *asked == serial {
+        if full
+            && let Some((asked, solved)) = &self.solving
+            && *asked == serial
+        {
             self.solved = Some(solved.clone());
         }
         let rank = if passes == 0 { u32::from(full) } else { 1 + passes };
@@ -430,7 +437,7 @@ impl App {
             self.save();
         }
         if pressed(Key::F) {
-            self.state.frame_all(&self.pack);
+            self.state.frame_all();
         }
         if pressed(Key::E) {
             self.expose();
@@ -484,7 +491,7 @@ impl App {
             }
         }
         if response.double_clicked() {
-            self.state.frame_all(&self.pack);
+            self.state.frame_all();
         }
     }
 

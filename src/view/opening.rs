@@ -73,6 +73,8 @@ impl Opening {
                 Error::invalid(&self.pack, "frame", number, expected)
             })?,
         };
+        let frame = Frame::read(&pack, fullest)?;
+        let extent = framing::extent(&pack, &frame);
         let (scene, folder) = match &self.scene {
             Some(path) => {
                 let scene = Scene::read(path)?;
@@ -83,13 +85,10 @@ impl Opening {
                 }
                 (scene, path.parent())
             }
-            None => {
-                let frame = Frame::read(&pack, fullest)?;
-                (framing::first_scene(&pack, &frame, UpAxis::Z, self.size), self.pack.parent())
-            }
+            None => (framing::first_scene(&pack, &frame, &extent, UpAxis::Z, self.size), self.pack.parent()),
         };
         let offered = folder.map(skies_of_folder).unwrap_or_default();
-        let state = State::new(scene, self.scene.is_none(), position, self.method, offered);
+        let state = State::new(scene, self.scene.is_none(), position, self.method, offered, extent);
         Ok(Opened { pack: Arc::new(pack), state })
     }
 }

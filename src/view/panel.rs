@@ -42,7 +42,7 @@ pub fn style(ctx: &Context) {
         }
         style.text_styles.insert(TextStyle::Heading, FontId::proportional(15.0));
         style.spacing.slider_width = RAIL;
-        style.spacing.item_spacing = egui::vec2(8.0, 5.0);
+        style.spacing.item_spacing = egui::vec2(8.0, 3.0);
         style.visuals.panel_fill = Color32::from_gray(27);
         style.visuals.override_text_color = Some(Color32::from_gray(225));
     });
@@ -64,9 +64,8 @@ pub fn side(app: &mut App, ui: &mut Ui) {
 
 fn section(ui: &mut Ui, title: &str, contents: impl FnOnce(&mut Ui)) {
     ui.label(RichText::new(title).heading().strong().color(Color32::from_rgb(150, 190, 230)));
-    Grid::new(title).num_columns(2).min_col_width(82.0).show(ui, contents);
-    ui.add_space(2.0);
-    ui.separator();
+    Grid::new(title).num_columns(2).min_col_width(84.0).show(ui, contents);
+    ui.add_space(7.0);
 }
 
 /// A row of a section: its name, and what stands beside it.
@@ -211,11 +210,11 @@ fn camera(app: &mut App, ui: &mut Ui) {
     row(ui, "Up", |ui| {
         for (axis, name) in [(UpAxis::Y, "y"), (UpAxis::Z, "z")] {
             if ui.selectable_label(app.state.scene.up == axis, name).clicked() {
-                app.state.set_up(axis, &app.pack);
+                app.state.set_up(axis);
             }
         }
         if ui.button("see all").on_hover_text("F").clicked() {
-            app.state.frame_all(&app.pack);
+            app.state.frame_all();
         }
     });
     row(ui, "Picture", |ui| {
@@ -248,18 +247,56 @@ fn time(app: &mut App, ui: &mut Ui) {
     row(ui, "Decoded", |ui| text(ui, format!("{decoded} of {kept} frames, {waits} waited for")));
 }
 
+/// What a button of the timeline shows; the fonts have no such signs.
+#[derive(Clone, Copy)]
+enum Icon {
+    First,
+    Play,
+    Stop,
+    Last,
+}
+
+/// A button with an icon.
+fn icon(ui: &mut Ui, icon: Icon) -> egui::Response {
+    let (rect, response) = ui.allocate_exact_size(egui::vec2(32.0, 24.0), egui::Sense::click());
+    let look = ui.style().interact(&response);
+    let (painter, colour, c) = (ui.painter(), look.fg_stroke.color, rect.center());
+    painter.rect_filled(rect, look.corner_radius, look.weak_bg_fill);
+    let bar = |x: f32| {
+        painter.rect_filled(Rect::from_center_size(c + egui::vec2(x, 0.0), egui::vec2(3.0, 12.0)), 0.0, colour);
+    };
+    let arrow = |tip: f32, base: f32| {
+        let points = vec![c + egui::vec2(tip, 0.0), c + egui::vec2(base, 6.0), c + egui::vec2(base, -6.0)];
+        painter.add(egui::Shape::convex_polygon(points, colour, egui::Stroke::NONE));
+    };
+    match icon {
+        Icon::First => {
+            bar(-5.0);
+            arrow(-3.0, 6.0);
+        }
+        Icon::Play => arrow(6.0, -4.0),
+        Icon::Stop => [-3.5, 3.5].into_iter().for_each(bar),
+        Icon::Last => {
+            arrow(3.0, -6.0);
+            bar(5.0);
+        }
+    }
+    response
+}
+
 /// The timeline below the picture.
 pub fn timeline(app: &mut App, ui: &mut Ui) {
     egui::Panel::bottom("timeline").exact_size(40.0).resizable(false).show(ui, |ui| {
         ui.horizontal_centered(|ui| {
             let count = app.playback.count();
-            if ui.button("⏮").on_hover_text("first frame (Home)").clicked() {
+            if icon(ui, Icon::First).on_hover_text("first frame (Home)").clicked() {
                 app.step(-(app.state.position as isize));
             }
-            if ui.button(if app.is_playing() { "⏸" } else { "▶" }).on_hover_text("play, stop (Space)").clicked() {
+            let play = if app.is_playing() { Icon::Stop } else { Icon::Play };
+            if icon(ui, play).on_hover_text("play, stop (Space)").clicked() {
                 app.toggle_play();
             }
-            if ui.button("⏭").on_hover_text("last frame (End)").clicked() {
+            if icon(ui, Icon::Last).on_hover_text("last frame (End)").clicked() {
                 app.step(-1 - app.state.position as isize);
             }
             let number = app.pack.frames().get(app.state.position).map_or(0, |f| f.frame);

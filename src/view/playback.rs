@@ -73,7 +73,12 @@ impl Shared {
 impl Playback {
     /// Begins to decode `pack` from `playhead` on, with the frames' transfer if `with_transfer`. `decoded` is called when
     /// a frame is ready.
-    pub fn start(pack: Arc<Pack>, with_transfer: bool, playhead: usize, decoded: impl Fn() + Send + Sync + 'static) -> Self {
+    pub fn start(
+        pack: Arc<Pack>,
+        with_transfer: bool,
+        playhead: usize,
+        decoded: impl Fn() + Send + Sync + 'static,
+    ) -> Self {
         let count = pack.frames().len();
         let kept = kept(pack.sequence().dims, count);
         let (decoded_frames, busy) = (HashMap::new(), HashSet::new());

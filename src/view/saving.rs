@@ -176,7 +176,7 @@ mod tests {
         image::write_channels(&sky, &image).unwrap();
         let mut scene = stage().scene;
         (scene.camera.position, scene.camera.target) = ([7.0, -6.0, 3.5], [7.0, 1.7, 3.5]);
-        let mut state = State::new(scene, false, 1, MethodChoice::Auto, Vec::new());
+        let mut state = State::new(scene, false, 1, MethodChoice::Auto, Vec::new(), Vec::new());
         let at = state.offer(super::super::state::sky_at(&sky).unwrap());
         state.pick(Some(at));
         state.set_sun(Some(super::super::state::Sun { azimuth: 30.0, elevation: 20.0, strength: 2.0 }));

@@ -9,13 +9,13 @@ use crate::cli::MethodChoice;
 use crate::method::Method;
 use glam::{DQuat, DVec3};
 use smoke_formats::image;
-use smoke_formats::pack::Pack;
 use smoke_formats::scene::{Light, Scene, Sky, UpAxis};
 use smoke_runtime::plan::ladder::rung;
 use smoke_runtime::renderer::{RenderSettings, Route};
 use smoke_runtime::transport::reference::ReferenceSettings;
 use smoke_runtime::transport::transfer::source::TransferSettings;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// Qualities by the names of the plan's rungs, with the error that the reference is traced to.
 pub const QUALITIES: [(&str, f64); 5] =
@@ -50,6 +50,8 @@ pub struct State {
     pub stops: f64,
     /// What the picker offers.
     pub skies: Vec<SkyChoice>,
+    /// What a camera that sees all must see, world space.
+    extent: Arc<[DVec3]>,
     /// The sun that comes when it is switched on.
     sun: Light,
 }
@@ -66,8 +68,16 @@ pub struct Sun {
 }
 
 impl State {
-    /// A state that shows `scene` at `position`, by `method` or by what the scene needs.
-    pub fn new(scene: Scene, fills_window: bool, position: usize, method: MethodChoice, skies: Vec<SkyChoice>) -> Self {
+    /// A state that shows `scene` at `position`, by `method` or by what the scene needs. The picker offers the scene's
+    /// skies, a plain one, and `skies`.
+    pub fn new(
+        scene: Scene,
+        fills_window: bool,
+        position: usize,
+        method: MethodChoice,
+        skies: Vec<SkyChoice>,
+        extent: Vec<DVec3>,
+    ) -> Self {
         let point = scene.lights.iter().any(|light| matches!(light, Light::Point { .. }));
         let method = match method {
             MethodChoice::Auto if point => MethodChoice::Reference,
@@ -81,10 +91,12 @@ impl State {
             UpAxis::Y => Light::Directional { direction: [0.6, -0.5, -0.6], irradiance: [3.0; 3] },
         });
         let quality = QUALITIES.iter().position(|q| q.0 == "default").unwrap_or(0);
-        let mut state = Self { scene, fills_window, position, method, quality, stops: 0.0, skies: Vec::new(), sun };
+        let (stops, extent) = (0.0, extent.into());
+        let mut state = Self { scene, fills_window, position, method, quality, stops, skies: Vec::new(), extent, sun };
         let plain = SkyChoice { name: "plain sky".into(), sky: sky_of(&framing::plain_sky()) };
         let own = state.scene.lights.iter().filter(|l| matches!(l, Light::Environment { .. })).map(sky_of);
-        let own: Vec<SkyChoice> = own.map(|sky| SkyChoice { name: sky_name(&sky), sky }).collect();
+        let choice = |sky: Sky| if sky == plain.sky { plain.clone() } else { SkyChoice { name: sky_name(&sky), sky } };
+        let own: Vec<SkyChoice> = own.map(choice).collect();
         own.into_iter().chain([plain]).chain(skies).for_each(|choice| {
             state.offer(choice);
         });
@@ -193,13 +205,13 @@ impl State {
     }
 
     /// Turns the world's up, camera and sun with it.
-    pub fn set_up(&mut self, up: UpAxis, pack: &Pack) {
+    pub fn set_up(&mut self, up: UpAxis) {
         if up == self.scene.up {
             return;
         }
         let sun = self.sun();
         self.scene.up = up;
-        self.frame_all(pack);
+        self.frame_all();
         if let (Some(sun), Some(Light::Directional { direction, .. })) =
             (sun, self.scene.lights.iter_mut().find(|l| matches!(l, Light::Directional { .. })))
         {
@@ -208,9 +220,9 @@ impl State {
     }
 
     /// A camera that sees the whole sequence, from where the first one would.
-    pub fn frame_all(&mut self, pack: &Pack) {
+    pub fn frame_all(&mut self) {
         let aspect = f64::from(self.scene.width) / f64::from(self.scene.height);
-        self.scene.camera = framing::camera(&framing::corners(pack), self.scene.up, aspect);
+        self.scene.camera = framing::camera(&self.extent, self.scene.up, aspect);
     }
 
     /// The method with the dials of its quality.
@@ -278,7 +290,7 @@ fn sky_of(light: &Light) -> Sky {
 pub fn sky_name(sky: &Sky) -> String {
     match sky {
         Sky::Image { resolved, .. } => name_of(resolved),
-        Sky::Color(_) => "colour".into(),
+        Sky::Color([r, g, b]) => format!("colour {r}, {g}, {b}"),
     }
 }
 
@@ -321,7 +333,7 @@ mod tests {
             framing::plain_sky(),
             Light::Directional { direction: [0.9, 0.35, -0.5], irradiance: [14.0, 12.0, 7.0] },
         ];
-        State::new(scene, true, 0, MethodChoice::Auto, Vec::new())
+        State::new(scene, true, 0, MethodChoice::Auto, Vec::new(), Vec::new())
     }
 
     #[test]
@@ -378,10 +390,10 @@ mod tests {
         let mut state = sunny(UpAxis::Z);
         let sun = state.sun().unwrap();
         state.set_sun(Some(Sun { strength: 28.0, ..sun }));
-        assert_eq!(state.scene.lights[1], Light::Directional {
-            direction: [0.9, 0.35, -0.5],
-            irradiance: [28.0, 24.0, 14.0]
-        });
+        assert_eq!(
+            state.scene.lights[1],
+            Light::Directional { direction: [0.9, 0.35, -0.5], irradiance: [28.0, 24.0, 14.0] }
+        );
         state.scene.medium.sigma_t = [4.0, 2.0, 1.0];
         state.set_sigma_t(8.0);
         assert_eq!(state.scene.medium.sigma_t, [8.0, 4.0, 2.0]);
@@ -412,7 +424,7 @@ mod tests {
     fn auto_is_the_fast_method_and_a_point_light_needs_the_reference() {
         let mut scene = stage().scene;
         scene.lights.push(Light::Point { position: [0.0; 3], intensity: [1.0; 3] });
-        let point = State::new(scene, false, 0, MethodChoice::Auto, Vec::new());
+        let point = State::new(scene, false, 0, MethodChoice::Auto, Vec::new(), Vec::new());
         assert!(matches!((point.method(), point.moving_method()), (Method::Reference(_), Method::Reference(_))));
         let state = sunny(UpAxis::Z);
         assert_eq!(state.method(), Method::Compensated(RenderSettings::default()));

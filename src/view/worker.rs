@@ -3,8 +3,8 @@
 //! A request that is *moving* gets one picture at once, with as many pixels as fit into [`MOVING_SECONDS`]; one at rest is
 //! refined pass after pass, and each pass gives the mean so far, until something newer is asked. The first pass at rest is
 //! the image that `render` makes at this size; the passes after it look through other points of their pixels, by a turn of
-//! the camera of less than a pixel: the offsets are those of Roberts' R2 sequence (2018), which fills the pixel evenly
-//! after any number.
+//! the camera of less than a pixel: the offsets are the first two dimensions of Sobol's sequence (1967), whose first 4^k
+//! points have one in each of 4^k equal squares of the pixel.
 
 use super::painter::{Painter, Stages};
 use crate::cli::DeviceChoice;
@@ -273,8 +273,13 @@ fn coarse(camera: &Camera, divisor: usize) -> Camera {
 
 /// Where pass `number` looks through its pixels, in pixels from their middle: the middle first.
 fn offset(number: u32) -> [f64; 2] {
-    // 1 / p and 1 / p^2 with p^3 = p + 1.
-    [0.754_877_666_246_693, 0.569_840_290_998_053_3].map(|step| (0.5 + f64::from(number) * step).fract() - 0.5)
+    let (mut second, mut direction) = (0u32, 1u32 << 31);
+    for bit in 0..32 {
+        second ^= direction * (number >> bit & 1);
+        direction ^= direction >> 1;
+    }
+    // The first point is 0: half a pixel on, round the end, lies the middle.
+    [number.reverse_bits(), second].map(|v| f64::from(v ^ 1 << 31) / 2f64.powi(32) - 0.5)
 }
 
 /// `camera` turned so that the middle of its image is `x` pixels to the right and `y` down from where it was.
@@ -296,6 +301,7 @@ mod tests {
     use smoke_formats::scene::{Light, Sky};
     use smoke_runtime::film::Pixel;
     use smoke_runtime::renderer::{RenderSettings, Renderer};
+    use std::collections::BTreeSet;
     use std::time::{Duration, Instant};
 
     fn request() -> Request {
@@ -394,9 +400,12 @@ mod tests {
     #[test]
     fn offsets_begin_in_the_middle_and_spread_evenly() {
         assert_eq!(offset(0), [0.0, 0.0]);
-        let mut cells = [0; 4];
-        (0..16).map(offset).for_each(|[x, y]| cells[usize::from(x > 0.0) + 2 * usize::from(y > 0.0)] += 1);
-        assert!(cells.iter().all(|&n| (3..=5).contains(&n)), "{cells:?}");
+        for side in [2, 4, 8] {
+            let cell = |number| offset(number).map(|v| ((v + 0.5) * side as f64) as usize);
+            let cells: BTreeSet<[usize; 2]> = (0..side * side).map(cell).collect();
+            assert_eq!(cells.len() as u32, side * side, "one point in each square");
+            assert!(cells.iter().flatten().all(|&c| c < side as usize));
+        }
     }
 
     #[test]
