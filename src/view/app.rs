@@ -1,29 +1,27 @@
 //! The window: takes what the user does to the state, the state to the workers, and their pictures to the screen.
 
-use super::opening::{Dropped, Opened, Opening};
+use super::opening::{Opened, Opening};
 use super::playback::Playback;
 use super::saving::Saving;
 use super::shot::{Outcome, Shot};
-use super::state::{State, sky_at};
+use super::state::State;
 use super::worker::{Picture, Request, Skies, Worker};
-use super::{orbit, painter, panel, tone};
+use super::{painter, panel, tone};
 use crate::cli::{DeviceChoice, MethodChoice, ViewArgs};
 use crate::failure::Failure;
 use crate::method::Method;
-use eframe::egui::{self, ColorImage, Context, Key, Rect, TextureHandle, TextureOptions, Vec2, ViewportBuilder};
+use eframe::egui::{self, ColorImage, Context, Rect, TextureHandle, TextureOptions, Vec2, ViewportBuilder};
 use smoke_formats::pack::Pack;
 use smoke_formats::scene::{Light, Medium, Scene, UpAxis};
 use smoke_runtime::film::Film;
 use std::collections::VecDeque;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, channel};
 use std::sync::{Arc, PoisonError};
 use std::time::{Duration, Instant};
 
 /// Time without a change after which a picture is refined.
 const SETTLED: Duration = Duration::from_millis(120);
-/// Degrees that a drag across the picture's width turns.
-const TURN: f64 = 270.0;
 /// Frames a second where the pack does not say.
 const FPS: f64 = 24.0;
 
@@ -99,14 +97,18 @@ pub struct App {
     solving: Option<(u64, Solved)>,
     quick: Worker,
     full: Worker,
-    skies: Skies,
+    /// Environment images.
+    pub skies: Skies,
     with_transfer: bool,
-    opening: Option<Receiver<Result<Opened, Failure>>>,
-    method: MethodChoice,
+    /// What is being opened.
+    pub opening: Option<Receiver<Result<Opened, Failure>>>,
+    /// The method that was asked for, for what is opened later.
+    pub method: MethodChoice,
     saving: Option<Receiver<Result<PathBuf, Failure>>>,
     output: PathBuf,
     shot: Option<Shot>,
-    ctx: Context,
+    /// The window.
+    pub ctx: Context,
 }
 
 /// Opens pack and scene, then the window.
@@ -119,7 +121,11 @@ pub fn run(args: &ViewArgs) -> Result<(), Failure> {
     let size = Vec2::new(args.width as f32, args.height as f32);
     let viewport = ViewportBuilder::default().with_title(title).with_inner_size(size).with_drag_and_drop(true);
     let options = eframe::NativeOptions { viewport, ..Default::default() };
-    let create: eframe::AppCreator<'_> = Box::new(|cc| Ok(Box::new(App::new(cc, args, opened, skies, shot))));
+    let create: eframe::AppCreator<'_> = Box::new(|cc| {
+        let info = cc.wgpu_render_state.as_ref().map(|render| render.adapter.get_info());
+        let screen = info.map_or_else(String::new, |info| format!("{} ({})", info.name, info.backend));
+        Ok(Box::new(App::new(cc.egui_ctx.clone(), screen, args, opened, skies, shot)))
+    });
     eframe::run_native("smoke-bake", options, create).map_err(|e| {
         let (missing, why) = match e {
             // Its text names a line of the source.
@@ -137,14 +143,7 @@ pub fn run(args: &ViewArgs) -> Result<(), Failure> {
 }
 
 impl App {
-    fn new(
-        cc: &eframe::CreationContext<'_>,
-        args: &ViewArgs,
-        opened: Opened,
-        skies: Skies,
-        shot: Option<Shot>,
-    ) -> Self {
-        let ctx = cc.egui_ctx.clone();
+    fn new(ctx: Context, screen: String, args: &ViewArgs, opened: Opened, skies: Skies, shot: Option<Shot>) -> Self {
         panel::style(&ctx);
         let waker = |ctx: &Context| {
             let ctx = ctx.clone();
@@ -152,10 +151,6 @@ impl App {
         };
         let Opened { pack, state } = opened;
         let with_transfer = state.method == MethodChoice::Transfer;
-        let screen = cc.wgpu_render_state.as_ref().map_or_else(String::new, |render| {
-            let info = render.adapter.get_info();
-            format!("{} ({})", info.name, info.backend)
-        });
         Self {
             playback: Playback::start(pack.clone(), with_transfer, state.position, waker(&ctx)),
             fps: pack.sequence().frames_per_second.unwrap_or(FPS),
@@ -184,6 +179,11 @@ impl App {
             state,
             ctx,
         }
+    }
+
+    /// True while a picture at rest is in work or done.
+    pub fn is_at_rest(&self) -> bool {
+        self.asked.at_rest
     }
 
     /// True while it plays.
@@ -224,11 +224,13 @@ impl App {
         self.say("saving at full quality ...", false);
     }
 
-    fn say(&mut self, text: impl Into<String>, bad: bool) {
+    /// Says something over the picture.
+    pub fn say(&mut self, text: impl Into<String>, bad: bool) {
         self.message = Some(Message { text: text.into(), bad });
     }
 
-    fn on_a_thread<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> Receiver<T> {
+    /// Does `work` beside the window.
+    pub fn on_a_thread<T: Send + 'static>(&self, work: impl FnOnce() -> T + Send + 'static) -> Receiver<T> {
         let (sender, receiver) = channel();
         let ctx = self.ctx.clone();
         std::thread::spawn(move || {
@@ -237,36 +239,6 @@ impl App {
             ctx.request_repaint();
         });
         receiver
-    }
-
-    /// Files that were dropped onto the window.
-    fn take_dropped(&mut self) {
-        for file in self.ctx.input(|i| i.raw.dropped_files.clone()) {
-            let path = file.path().to_owned();
-            let (pack, scene) = match Dropped::of(&path) {
-                Dropped::Pack => (path, None),
-                Dropped::Scene => (self.pack.path().to_owned(), Some(path)),
-                Dropped::Sky => {
-                    match sky_at(&path) {
-                        Some(choice) => {
-                            let at = self.state.offer(choice);
-                            self.state.pick(Some(at));
-                        }
-                        None => self.say("the image's name is not UTF-8, which a scene file needs; rename it", true),
-                    }
-                    continue;
-                }
-                Dropped::Other(message) => {
-                    self.say(message, true);
-                    continue;
-                }
-            };
-            let size = [self.state.scene.width, self.state.scene.height];
-            let opening = Opening { pack, scene, frame: None, method: self.method, size };
-            let skies = self.skies.clone();
-            self.say("opening ...", false);
-            self.opening = Some(self.on_a_thread(move || opening.open(&skies)));
-        }
     }
 
     /// What other threads have done.
@@ -288,7 +260,7 @@ impl App {
         if let Some(saved) = self.saving.as_ref().and_then(|r| r.try_recv().ok()) {
             self.saving = None;
             match saved {
-                Ok(path) => self.say(format!("saved {}, with its .exr and .png", path.display()), false),
+                Ok(path) => self.say(said_of(&path), false),
                 Err(failure) => self.say(one_line(failure), true),
             }
         }
@@ -412,52 +384,6 @@ impl App {
         }
     }
 
-    fn keys(&mut self) {
-        if self.ctx.egui_wants_keyboard_input() {
-            return;
-        }
-        let ctx = self.ctx.clone();
-        let pressed = |key: Key| ctx.input(|i| i.key_pressed(key) && !i.modifiers.command);
-        if pressed(Key::Space) {
-            self.toggle_play();
-        }
-        if pressed(Key::ArrowLeft) {
-            self.step(-1);
-        }
-        if pressed(Key::ArrowRight) {
-            self.step(1);
-        }
-        if pressed(Key::Home) {
-            self.step(-(self.state.position as isize));
-        }
-        if pressed(Key::End) {
-            self.step(-1 - self.state.position as isize);
-        }
-        if pressed(Key::S) {
-            self.save();
-        }
-        if pressed(Key::F) {
-            self.state.frame_all();
-        }
-        if pressed(Key::E) {
-            self.expose();
-        }
-        let stops = f64::from(i8::from(pressed(Key::CloseBracket)) - i8::from(pressed(Key::OpenBracket)));
-        self.state.stops += stops / 3.0;
-        if pressed(Key::H) {
-            self.open[0] = !self.open[0];
-        }
-        if pressed(Key::F1) {
-            self.open[1] = !self.open[1];
-        }
-        if pressed(Key::Q) || ctx.input(|i| i.modifiers.command && i.key_pressed(Key::Q)) {
-            ctx.send_viewport_cmd(egui::ViewportCommand::Close);
-        }
-        if pressed(Key::Escape) {
-            (self.message, self.open[1]) = (None, false);
-        }
-    }
-
     /// Chooses the exposure from the picture that is shown.
     pub fn expose(&mut self) {
         if let Some(stops) = self.shown.as_ref().and_then(|s| tone::stops_for(&s.film)) {
@@ -465,33 +391,23 @@ impl App {
         }
     }
 
-    /// The mouse on the picture, whose rectangle is `rect`.
-    fn mouse(&mut self, response: &egui::Response, rect: Rect) {
-        let (lights, pan) = self.ctx.input(|i| {
-            let shift = i.modifiers.shift || i.pointer.secondary_down() || i.pointer.middle_down();
-            (i.key_down(Key::L) || i.modifiers.ctrl, shift)
-        });
-        let moved = response.drag_delta() / rect.width().max(1.0);
-        let (x, y) = (f64::from(moved.x), f64::from(moved.y));
-        let State { scene, .. } = &mut self.state;
-        if moved != Vec2::ZERO {
-            if lights {
-                self.state.turn_lights(x * TURN);
-            } else if pan {
-                orbit::pan(&mut scene.camera, x, y);
-            } else {
-                orbit::turn(&mut scene.camera, scene.up, -x * TURN, y * TURN);
-            }
+    /// One frame of the window.
+    fn frame(&mut self, ui: &mut egui::Ui) {
+        self.take_dropped();
+        self.take_answers();
+        self.keys();
+        self.play();
+        let now = Instant::now();
+        self.pictures.retain(|at| now - *at < Duration::from_secs(1));
+        panel::timeline(self, ui);
+        if self.open[0] {
+            panel::side(self, ui);
         }
-        if response.hovered() {
-            let (scroll, pinch) = self.ctx.input(|i| (i.smooth_scroll_delta().y, i.zoom_delta()));
-            let factor = (f64::from(-scroll) * 0.003).exp() / f64::from(pinch.max(0.1));
-            if factor != 1.0 {
-                orbit::approach(&mut self.state.scene.camera, factor);
-            }
-        }
-        if response.double_clicked() {
-            self.state.frame_all();
+        let frame = egui::Frame::new().fill(egui::Color32::from_gray(8));
+        egui::CentralPanel::default().frame(frame).show(ui, |ui| self.picture(ui));
+        let complete = self.shown.as_ref().is_some_and(|s| s.serial == self.asked.serial && s.passes[0] > 0);
+        if let Some(shot) = &mut self.shot {
+            shot.advance(&self.ctx, complete || self.message.as_ref().is_some_and(|m| m.bad));
         }
     }
 
@@ -526,23 +442,21 @@ impl App {
 
 impl eframe::App for App {
     fn ui(&mut self, ui: &mut egui::Ui, _: &mut eframe::Frame) {
-        self.take_dropped();
-        self.take_answers();
-        self.keys();
-        self.play();
-        let now = Instant::now();
-        self.pictures.retain(|at| now - *at < Duration::from_secs(1));
-        panel::timeline(self, ui);
-        if self.open[0] {
-            panel::side(self, ui);
-        }
-        let frame = egui::Frame::new().fill(egui::Color32::from_gray(8));
-        egui::CentralPanel::default().frame(frame).show(ui, |ui| self.picture(ui));
-        let complete = self.shown.as_ref().is_some_and(|s| s.serial == self.asked.serial && s.passes[0] > 0);
-        if let Some(shot) = &mut self.shot {
-            shot.advance(&self.ctx, complete || self.message.as_ref().is_some_and(|m| m.bad));
+        self.frame(ui);
+    }
+
+    fn on_exit(&mut self) {
+        // What was asked to be saved is saved.
+        match self.saving.take().map(|saving| saving.recv()) {
+            Some(Ok(Ok(path))) => eprintln!("smoke-bake: {}", said_of(&path)),
+            Some(Ok(Err(failure))) => eprintln!("smoke-bake: {}", one_line(failure)),
+            Some(Err(_)) | None => {}
         }
     }
+}
+
+fn said_of(path: &Path) -> String {
+    format!("saved {}, with its .exr and .png", path.display())
 }
 
 fn image(film: &Film, stops: f64) -> ColorImage {
@@ -555,3 +469,7 @@ fn one_line(failure: Failure) -> String {
         Failure::Usage(e) => e.to_string(),
     }
 }
+
+#[cfg(test)]
+#[path = "app_tests.rs"]
+mod tests;

@@ -12,7 +12,7 @@
 //! | `tone` | a film into bytes |
 //! | `saving` | scene file, OpenEXR and PNG |
 //! | `shot` | the picture of the window itself |
-//! | `app`, `panel` | the window |
+//! | `app`, `input`, `panel` | the window, what the user does, what stands round the picture |
 //!
 //! Two workers make pictures: one with few terms of light, which answers at once while something moves, and one with the
 //! chosen quality, which also follows a camera that moves, because that solves nothing anew.
@@ -21,6 +21,8 @@
 mod app;
 #[cfg(feature = "view")]
 mod framing;
+#[cfg(feature = "view")]
+mod input;
 #[cfg(feature = "view")]
 mod opening;
 #[cfg(feature = "view")]

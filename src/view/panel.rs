@@ -69,7 +69,7 @@ fn section(ui: &mut Ui, title: &str, contents: impl FnOnce(&mut Ui)) {
 }
 
 /// A row of a section: its name, and what stands beside it.
-fn row(ui: &mut Ui, name: &str, contents: impl FnOnce(&mut Ui)) {
+fn row(ui: &mut Ui, name: impl Into<egui::WidgetText>, contents: impl FnOnce(&mut Ui)) {
     ui.label(name);
     ui.horizontal(contents);
     ui.end_row();
@@ -99,7 +99,7 @@ fn light(app: &mut App, ui: &mut Ui) {
     }
     if let Some((_, rotation, intensity, visible)) = state.environment() {
         row(ui, "Rotation", |ui| {
-            ui.add(Slider::new(rotation, 0.0..=360.0).suffix("°").fixed_decimals(1));
+            ui.add(slider(rotation, 0.0..=360.0).suffix("°").fixed_decimals(1));
         });
         row(ui, "Intensity", |ui| {
             ui.add(logarithmic(intensity, 1e-3, 1e3));
@@ -117,10 +117,10 @@ fn light(app: &mut App, ui: &mut Ui) {
         state.set_sun(on.then_some(Sun { azimuth: 0.0, elevation: 0.0, strength: 0.0 }));
     } else if let Some(mut sun) = before {
         row(ui, "Azimuth", |ui| {
-            ui.add(Slider::new(&mut sun.azimuth, -180.0..=180.0).suffix("°").fixed_decimals(1));
+            ui.add(slider(&mut sun.azimuth, -180.0..=180.0).suffix("°").fixed_decimals(1));
         });
         row(ui, "Elevation", |ui| {
-            ui.add(Slider::new(&mut sun.elevation, -90.0..=90.0).suffix("°").fixed_decimals(1));
+            ui.add(slider(&mut sun.elevation, -90.0..=90.0).suffix("°").fixed_decimals(1));
         });
         row(ui, "Strength", |ui| {
             ui.add(logarithmic(&mut sun.strength, 1e-3, 1e4));
@@ -129,11 +129,14 @@ fn light(app: &mut App, ui: &mut Ui) {
     }
 }
 
-/// A slider over orders of magnitude; what is typed may lie outside, but not below zero.
+/// A slider that leaves a value outside its range as it is, until the user moves it.
+fn slider(value: &mut f64, range: std::ops::RangeInclusive<f64>) -> Slider<'_> {
+    Slider::new(value, range).clamping(egui::SliderClamping::Edits)
+}
+
+/// The same over orders of magnitude, and zero.
 fn logarithmic(value: &mut f64, low: f64, high: f64) -> Slider<'_> {
-    // A value outside the range keeps its place at the end.
-    let range = 0.0..=high.max(*value);
-    Slider::new(value, range).logarithmic(true).smallest_positive(low).max_decimals(4)
+    slider(value, 0.0..=high).logarithmic(true).smallest_positive(low).max_decimals(4)
 }
 
 fn medium(app: &mut App, ui: &mut Ui) {
@@ -157,7 +160,7 @@ fn medium(app: &mut App, ui: &mut Ui) {
         }
     });
     row(ui, "g", |ui| {
-        ui.add_enabled(free, Slider::new(&mut medium.g, -0.95..=0.95).max_decimals(3));
+        ui.add_enabled(free, slider(&mut medium.g, -0.95..=0.95).max_decimals(3));
     });
 }
 
@@ -205,7 +208,7 @@ fn picture(app: &mut App, ui: &mut Ui) {
 
 fn camera(app: &mut App, ui: &mut Ui) {
     row(ui, "View angle", |ui| {
-        ui.add(Slider::new(&mut app.state.scene.camera.fov_degrees, 2.0..=120.0).suffix("°").fixed_decimals(1));
+        ui.add(slider(&mut app.state.scene.camera.fov_degrees, 2.0..=120.0).suffix("°").fixed_decimals(1));
     });
     row(ui, "Up", |ui| {
         for (axis, name) in [(UpAxis::Y, "y"), (UpAxis::Z, "z")] {
@@ -236,10 +239,14 @@ fn time(app: &mut App, ui: &mut Ui) {
     });
     let Some(shown) = &app.shown else { return };
     let [passes, of] = shown.passes;
-    let progress = if passes == 0 { "moving".to_owned() } else { format!("pass {passes} of {of}") };
+    let progress = match passes {
+        0 if app.is_at_rest() => "a sketch; full quality is in work".to_owned(),
+        0 => "moving".to_owned(),
+        _ => format!("pass {passes} of {of}"),
+    };
     row(ui, "Picture", |ui| text(ui, progress));
     for (name, seconds) in &shown.stages {
-        row(ui, name, |ui| text(ui, format!("{:.1} ms", seconds * 1e3)));
+        row(ui, RichText::new(*name).small(), |ui| text(ui, format!("{:.1} ms", seconds * 1e3)));
     }
     row(ui, "Pictures", |ui| text(ui, format!("{} a second", app.rate())));
     let (decoded, kept) = app.playback.fill();
