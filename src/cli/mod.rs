@@ -17,7 +17,9 @@ pub use render::{
     Detail, ExponentialChoice, MethodChoice, MultipleChoice, RenderArgs, RouteChoice, ScatteringOrders, SunChoice,
 };
 pub use sweep::{ALL_RUNGS, Assignment, SweepArgs};
-pub use view::{DeviceChoice, ViewArgs};
+#[cfg(feature = "view")]
+pub use view::DeviceChoice;
+pub use view::ViewArgs;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use smoke_formats::sequence::FrameSelection;

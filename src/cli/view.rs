@@ -14,7 +14,6 @@ pub enum DeviceChoice {
 
 /// Options of `view`.
 #[derive(Args, Debug)]
-#[cfg_attr(not(feature = "view"), expect(dead_code, reason = "without its window, view reads none of them"))]
 pub struct ViewArgs {
     /// The pack.
     pub pack: PathBuf,

@@ -13,8 +13,8 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 const BYTES: u64 = 1 << 30;
 /// Fewest frames that are kept, however large: the one that is shown, and the next.
 const FEWEST: usize = 2;
-/// Threads that read and decode.
-const THREADS: usize = 2;
+/// Threads that read and decode: half of the machine's, within these.
+const THREADS: [usize; 2] = [2, 8];
 
 /// A decoded frame, or why there is none.
 pub type Decoded = Result<Arc<Frame>, String>;
@@ -85,7 +85,8 @@ impl Playback {
         let reel = Reel { count, kept, playhead, decoded: decoded_frames, busy, closed: false };
         let shared = Arc::new(Shared { reel: Mutex::new(reel), wake: Condvar::new() });
         let ready = Arc::new(decoded);
-        for _ in 0..THREADS {
+        let cores = std::thread::available_parallelism().map_or(1, usize::from);
+        for _ in 0..(cores / 2).clamp(THREADS[0], THREADS[1]) {
             let (shared, pack, ready) = (shared.clone(), pack.clone(), ready.clone());
             std::thread::spawn(move || {
                 // A pool of its own: among the renderer's work a frame would wait for a whole picture.

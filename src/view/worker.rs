@@ -60,9 +60,12 @@ pub struct Picture {
 /// A picture, or the serial and the reason why there is none.
 pub type Answer = Result<Picture, (u64, String)>;
 
+/// An image, or why there is none.
+type ReadSky = Result<Arc<RgbImage>, String>;
+
 /// Environment images that were read, by path; those that could not be, with the reason.
 #[derive(Clone, Default)]
-pub struct Skies(Arc<Mutex<HashMap<PathBuf, Result<Arc<RgbImage>, String>>>>);
+pub struct Skies(Arc<Mutex<HashMap<PathBuf, ReadSky>>>);
 
 impl Skies {
     /// The image at `path`, read once.
