@@ -405,7 +405,8 @@ impl App {
         }
         let frame = egui::Frame::new().fill(egui::Color32::from_gray(8));
         egui::CentralPanel::default().frame(frame).show(ui, |ui| self.picture(ui));
-        let complete = self.shown.as_ref().is_some_and(|s| s.serial == self.asked.serial && s.passes[0] > 0);
+        let sharp = |s: &Shown| s.serial == self.asked.serial && s.passes[0] > 0;
+        let complete = self.shown.as_ref().is_some_and(|s| self.is_playing() || sharp(s));
         if let Some(shot) = &mut self.shot {
             shot.advance(&self.ctx, complete || self.message.as_ref().is_some_and(|m| m.bad));
         }
