@@ -10,6 +10,7 @@ use smoke_runtime::gpu::device::{Choice, ForcedLimits, Gpu, adapters};
 use std::sync::Arc;
 
 /// What marches.
+#[derive(Clone)]
 pub enum Device {
     /// The processor.
     Cpu,

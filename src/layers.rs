@@ -26,7 +26,7 @@ use toml::{Table, Value};
 pub const FILE_NAME: &str = "smoke-bake.toml";
 
 /// Options that only a flag can set.
-const FLAG_ONLY: [&str; 5] = ["help", "version", "output", "standard-error", "image-standard-error"];
+const FLAG_ONLY: [&str; 6] = ["help", "version", "output", "screenshot", "standard-error", "image-standard-error"];
 
 /// The command line with the environment and the settings file `path`, if it exists, below it.
 pub fn command(path: &Path) -> Result<Command, Failure> {

@@ -24,6 +24,7 @@ mod testing;
 mod transfer;
 mod unpack;
 mod validate;
+mod view;
 
 use clap::FromArgMatches;
 use cli::{Cli, Command};
@@ -56,6 +57,7 @@ fn dispatch(command: Command) -> Result<(), Failure> {
         Command::Unpack(args) => unpack::run(&args),
         Command::Compare(args) => compare::run(&args),
         Command::Sweep(args) => sweep::run(&args),
+        Command::View(args) => view::run(&args),
         Command::Demo(args) => demo::run(&args),
         Command::Devices(args) => devices::run(&args),
     }

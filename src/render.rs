@@ -29,14 +29,19 @@ struct Report {
 }
 
 /// What all frames of one run have in common.
-struct Job<'a> {
-    pack: &'a Pack,
-    scene: &'a Scene,
+pub struct Job<'a> {
+    /// The pack.
+    pub pack: &'a Pack,
+    /// The scene.
+    pub scene: &'a Scene,
     /// Dials and scene, for the metadata.
-    document: Value,
-    method: Method,
-    detail: Detail,
-    precision: SamplePrecision,
+    pub document: Value,
+    /// How the images are made.
+    pub method: Method,
+    /// How much of a frame is decoded.
+    pub detail: Detail,
+    /// How samples are stored.
+    pub precision: SamplePrecision,
 }
 
 /// Steps of progress that a frame counts for.
@@ -130,8 +135,7 @@ impl Job<'_> {
             progress.advance(now.saturating_sub(steps));
             steps = steps.max(now);
         };
-        let image = maker.image(frame, &mut advance);
-        let image = image.map_err(|e| Failure::work(format!("{}: frame {number}: {e}", self.pack.path().display())))?;
+        let image = self.image(position, frame, maker, &mut advance)?;
         advance(1.0);
         let start = Instant::now();
         let clamped = self.write(number, &image, &path)?;
@@ -140,7 +144,21 @@ impl Job<'_> {
         Ok(Report { frame: number, path, seconds, figures: image.figures, clamped })
     }
 
-    fn write(&self, number: i32, image: &Image, path: &Path) -> Result<usize, Error> {
+    /// The image of `frame`, which is the one at `position` of the pack.
+    pub fn image(
+        &self,
+        position: usize,
+        frame: Frame,
+        maker: &mut Maker,
+        done: &mut dyn FnMut(f64),
+    ) -> Result<Image, Failure> {
+        let number = self.pack.frames()[position].frame;
+        let image = maker.image(frame, done);
+        image.map_err(|e| Failure::work(format!("{}: frame {number}: {e}", self.pack.path().display())))
+    }
+
+    /// Writes the image of frame `number`; gives how many samples did not fit.
+    pub fn write(&self, number: i32, image: &Image, path: &Path) -> Result<usize, Error> {
         let film = &image.film;
         let rgb: Vec<[f32; 3]> = film.pixels.iter().map(|p| p.radiance).collect();
         let alpha: Vec<f32> = film.pixels.iter().map(|p| p.alpha()).collect();

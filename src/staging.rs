@@ -3,12 +3,13 @@
 use crate::cli::Rgb;
 use crate::failure::Failure;
 use glam::{DVec3, Vec3};
-use smoke_formats::image;
+use smoke_formats::image::{self, RgbImage};
 use smoke_formats::scene::{self, Scene, Sky, UpAxis};
 use smoke_runtime::camera::Camera;
 use smoke_runtime::light::{Environment, Light};
 use smoke_runtime::transport::medium::MediumParameters;
 use std::path::Path;
+use std::sync::Arc;
 
 /// Values that stand in for those of the scene file.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -40,8 +41,12 @@ pub struct Stage {
 impl Stage {
     /// Reads the scene file at `path` and the images that it names.
     pub fn read(path: &Path, changes: &SceneChanges) -> Result<Self, Failure> {
-        let scene = changed(Scene::read(path)?, path, changes)?;
-        let lights = lights(&scene)?;
+        Self::with(changed(Scene::read(path)?, path, changes)?, &mut |sky| read_sky(sky).map(Arc::new))
+    }
+
+    /// A scene that was checked, its images from `sky`.
+    pub fn with(scene: Scene, sky: &mut ReadSky) -> Result<Self, Failure> {
+        let lights = lights(&scene, sky)?;
         Ok(Self::of(scene, lights))
     }
 
@@ -72,19 +77,27 @@ fn changed(mut scene: Scene, path: &Path, changes: &SceneChanges) -> Result<Scen
     Ok(scene)
 }
 
-/// The scene's lights for the renderer; reads the environment images.
-fn lights(scene: &Scene) -> Result<Vec<Light>, Failure> {
-    let light = |light: &scene::Light| match light {
+/// Gives the environment image of a path.
+pub type ReadSky<'a> = dyn FnMut(&Path) -> Result<Arc<RgbImage>, Failure> + 'a;
+
+/// The environment image at `path`; says on stderr how many samples were below zero.
+pub fn read_sky(path: &Path) -> Result<RgbImage, Failure> {
+    let (image, negative) = image::read_environment(path)?;
+    if negative > 0 {
+        eprintln!("smoke-bake: {}: {negative} negative samples count as 0", path.display());
+    }
+    Ok(image)
+}
+
+/// The scene's lights for the renderer.
+fn lights(scene: &Scene, read: &mut ReadSky) -> Result<Vec<Light>, Failure> {
+    let mut light = |light: &scene::Light| match light {
         scene::Light::Environment { sky, rotation_degrees, intensity, visible } => {
             let factor = *intensity as f32;
             let mut environment = match sky {
                 Sky::Color(color) => Environment::constant(color.map(|v| v as f32 * factor)),
                 Sky::Image { resolved, .. } => {
-                    let (image, negative) = image::read_environment(resolved)?;
-                    if negative > 0 {
-                        let file = resolved.display();
-                        eprintln!("smoke-bake: {file}: {negative} negative samples count as 0");
-                    }
+                    let image = read(resolved)?;
                     let radiance = image.pixels.iter().map(|p| p.map(|v| v * factor)).collect();
                     Environment {
                         width: image.width,
@@ -108,5 +121,5 @@ fn lights(scene: &Scene) -> Result<Vec<Light>, Failure> {
             Ok(Light::Point { position: DVec3::from_array(*position), intensity: intensity.map(|v| v as f32) })
         }
     };
-    scene.lights.iter().map(light).collect()
+    scene.lights.iter().map(&mut light).collect()
 }

@@ -8,6 +8,7 @@ mod compare;
 mod plan;
 mod render;
 mod sweep;
+mod view;
 
 pub use bake::{AtRest, BakeArgs, GaussianCount, ResidualAddress, TeleportRule};
 pub use compare::{CompareArgs, Picture};
@@ -16,6 +17,7 @@ pub use render::{
     Detail, ExponentialChoice, MethodChoice, MultipleChoice, RenderArgs, RouteChoice, ScatteringOrders, SunChoice,
 };
 pub use sweep::{ALL_RUNGS, Assignment, SweepArgs};
+pub use view::ViewArgs;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use smoke_formats::sequence::FrameSelection;
@@ -55,6 +57,8 @@ pub enum Command {
     Compare(CompareArgs),
     /// Measure what every dial costs and buys, against a reference: tables and a page of plots.
     Sweep(SweepArgs),
+    /// Look at a pack in a window: turn, relight, play, and save what is seen.
+    View(ViewArgs),
     /// Bake and render a small plume that comes with the program, and relight it.
     Demo(DemoArgs),
     /// List the graphics devices that `render --device` can use.

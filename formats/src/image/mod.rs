@@ -19,7 +19,7 @@ mod write_png;
 pub use write_exr::{
     FrameMetadata, RenderedFrame, SETTINGS_ATTRIBUTE, STANDARD_ERROR, SamplePrecision, write_channels, write_frame,
 };
-pub use write_png::write_png;
+pub use write_png::{srgb_byte, write_png};
 
 use crate::{Error, Result};
 use std::fs::File;

@@ -30,7 +30,8 @@ pub fn write_png(path: &Path, image: &RgbImage) -> Result<()> {
     })
 }
 
-fn srgb_byte(linear: f32) -> u8 {
+/// Linear light as a byte of sRGB: 0 for NaN.
+pub fn srgb_byte(linear: f32) -> u8 {
     let v = f64::from(linear).clamp(0.0, 1.0);
     let encoded = if v <= 0.003_130_8 { 12.92 * v } else { 1.055 * v.powf(1.0 / 2.4) - 0.055 };
     (encoded * 255.0).round() as u8
