@@ -161,7 +161,7 @@ pub fn bake_run(
         };
         let reduced = visibility(fields, basis, sigma_t, rank(0), &done);
         out.seconds.direct += start.elapsed().as_secs_f64();
-        out.seconds.peak_bytes = out.seconds.peak_bytes.max(4 * reduced.rows.len() as u64 * 2);
+        out.seconds.peak_bytes = out.seconds.peak_bytes.max(4 * reduced.rows.len() as u64);
         let start = Instant::now();
         observe(Stage::Compress, 0, 1);
         let of_nodes = |field: &&DensityField| {

@@ -58,14 +58,15 @@ pub fn visibility(
     }
     let directions = of_sample(&sample, length, rank);
     let rank = directions.len() / length;
-    let mut reduced = Reduced { rank, rows: Vec::with_capacity(total * rank), directions, energy: 0.0 };
+    let mut reduced = Reduced { rank, rows: vec![0.0; total * rank], directions, energy: 0.0 };
+    let mut rest = &mut reduced.rows[..];
     for frame in &frames {
-        let mut rows = vec![0.0f32; frame.nodes.len() * rank];
+        let (rows, after) = std::mem::take(&mut rest).split_at_mut(frame.nodes.len() * rank);
+        rest = after;
         frame.sweep(&toward, sigma_t, |first, planes| {
-            reduced.energy += project(&mut rows, &frame.nodes, planes, first, &reduced.directions, length);
+            reduced.energy += project(rows, &frame.nodes, planes, first, &reduced.directions, length);
             done(planes.len() as u64);
         });
-        reduced.rows.extend(rows);
     }
     reduced
 }
