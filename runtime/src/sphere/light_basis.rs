@@ -102,6 +102,9 @@ pub struct LightBasis {
     overlaps: Vec<(u32, u32, f64)>,
 }
 
+/// Nodes whose functions reach a triangle, the integrals of these over it, and those of their products.
+type OfTriangle = ([u32; 6], [f64; 6], [[f64; 6]; 6]);
+
 /// The mesh that harmonics are sampled on: 642 directions.
 const HARMONICS_LEVEL: u32 = 3;
 
@@ -289,7 +292,7 @@ impl LightBasis {
     /// solid angle that it is seen under.
     fn quadrature(&self) -> (Vec<f64>, Vec<(u32, u32, f64)>) {
         let n = AREA_POINTS;
-        let parts: Vec<([u32; 6], [f64; 6], [[f64; 6]; 6])> = (0..self.mesh.triangles().len())
+        let parts: Vec<OfTriangle> = (0..self.mesh.triangles().len())
             .into_par_iter()
             .map(|t| {
                 let corners = self.mesh.triangles()[t].map(|n| self.mesh.directions()[n as usize]);
