@@ -145,7 +145,6 @@ pub fn run(args: &ViewArgs) -> Result<(), Failure> {
 }
 
 impl App {
-    #[expect(clippy::too_many_arguments, reason = "one call; what the window is made of")]
     fn new(
         ctx: Context,
         screen: String,
