@@ -11,6 +11,7 @@ mod devices;
 mod failure;
 mod inspect;
 mod layers;
+mod marcher;
 mod method;
 mod plan;
 mod progress;
@@ -24,6 +25,7 @@ mod testing;
 mod transfer;
 mod unpack;
 mod validate;
+#[cfg(feature = "view")]
 mod view;
 
 use clap::FromArgMatches;
@@ -57,7 +59,12 @@ fn dispatch(command: Command) -> Result<(), Failure> {
         Command::Unpack(args) => unpack::run(&args),
         Command::Compare(args) => compare::run(&args),
         Command::Sweep(args) => sweep::run(&args),
+        #[cfg(feature = "view")]
         Command::View(args) => view::run(&args),
+        #[cfg(not(feature = "view"))]
+        Command::View(_) => {
+            Err(Failure::work("view: this program was built without its window; build it with `--features view`"))
+        }
         Command::Demo(args) => demo::run(&args),
         Command::Devices(args) => devices::run(&args),
     }

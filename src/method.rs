@@ -3,18 +3,17 @@
 use crate::cli::{MethodChoice, RenderArgs};
 use crate::devices::Device;
 use crate::failure::Failure;
+use crate::marcher::{Marcher, marcher};
 use crate::staging::Stage;
 use crate::{compensated, plan, reference, transfer};
 use clap::error::ErrorKind;
 use serde_json::{Value, json};
 use smoke_formats::pack::Pack;
 use smoke_runtime::film::Film;
-#[cfg(feature = "gpu")]
-use smoke_runtime::gpu::renderer::GpuRenderer;
 use smoke_runtime::light::Light;
 use smoke_runtime::medium::frame::Frame;
 use smoke_runtime::plan::choose::Settings;
-use smoke_runtime::renderer::{RenderSettings, Renderer, Seconds};
+use smoke_runtime::renderer::{RenderSettings, Seconds};
 use smoke_runtime::transport::reference::{ReferenceSettings, trace};
 use std::time::Instant;
 
@@ -32,10 +31,7 @@ pub enum Method {
 /// A method ready for frames of one scene.
 pub enum Maker<'a> {
     /// Keeps what frames have in common.
-    Marched(Box<Renderer>, &'a Stage),
-    /// The same, on a graphics device.
-    #[cfg(feature = "gpu")]
-    OnDevice(Box<GpuRenderer>, &'a Stage),
+    Marched(Box<dyn Marcher>, &'a Stage),
     /// Keeps nothing.
     Reference(ReferenceSettings, &'a Stage),
 }
@@ -115,16 +111,10 @@ impl Method {
     /// Ready for frames under the lights and medium of `stage`, on `device`.
     pub fn maker<'a>(&self, stage: &'a Stage, device: &Device) -> Result<Maker<'a>, String> {
         Ok(match (self, device) {
-            (Self::Compensated(settings) | Self::Transfer(settings), Device::Cpu) => {
-                let renderer = Renderer::new(*settings, stage.medium, stage.lights.clone());
-                Maker::Marched(Box::new(renderer.map_err(|e| e.to_string())?), stage)
+            (Self::Compensated(settings) | Self::Transfer(settings), device) => {
+                Maker::Marched(marcher(device, *settings, stage)?, stage)
             }
             (Self::Reference(settings), Device::Cpu) => Maker::Reference(*settings, stage),
-            #[cfg(feature = "gpu")]
-            (Self::Compensated(settings) | Self::Transfer(settings), Device::Gpu(gpu)) => {
-                let renderer = GpuRenderer::new(gpu.clone(), *settings, stage.medium, stage.lights.clone());
-                Maker::OnDevice(Box::new(renderer.map_err(|e| e.to_string())?), stage)
-            }
             #[cfg(feature = "gpu")]
             (Self::Reference(_), Device::Gpu(_)) => {
                 return Err("method: found reference, expected another on a graphics device; use --device cpu".into());
@@ -138,18 +128,15 @@ impl Maker<'_> {
     pub fn image(&mut self, frame: Frame, done: &mut dyn FnMut(f64)) -> Result<Image, String> {
         let start = Instant::now();
         match self {
-            Self::Marched(renderer, stage) => {
-                renderer.set_frame(frame).map_err(|e| e.to_string())?;
+            Self::Marched(marcher, stage) => {
+                marcher.set_frame(frame)?;
                 let prepared = start.elapsed().as_secs_f64();
-                let (film, seconds) = renderer.render(&stage.camera).map_err(|e| e.to_string())?;
-                Ok(marched(film, seconds, prepared))
-            }
-            #[cfg(feature = "gpu")]
-            Self::OnDevice(renderer, stage) => {
-                renderer.set_frame(frame).map_err(|e| e.to_string())?;
-                let prepared = start.elapsed().as_secs_f64();
-                let (film, seconds) = renderer.render(&stage.camera).map_err(|e| e.to_string())?;
-                Ok(marched(film, seconds, prepared))
+                let (film, Seconds { source_radiance, volume_pass, view_pass }) = marcher.render(&stage.camera)?;
+                // What a frame takes to be taken up is part of its solution.
+                let source_radiance = source_radiance + prepared;
+                let seconds =
+                    vec![("source_radiance", source_radiance), ("volume_pass", volume_pass), ("view_pass", view_pass)];
+                Ok(Image { film, standard_error: None, seconds, figures: json!({}) })
             }
             Self::Reference(settings, stage) => {
                 let mut on_pass = |passes, error| done(reference::part_done(settings, passes, error));
@@ -162,12 +149,4 @@ impl Maker<'_> {
             }
         }
     }
-}
-
-/// The image of a march whose frame took `prepared` seconds to be taken up.
-fn marched(film: Film, seconds: Seconds, prepared: f64) -> Image {
-    let Seconds { source_radiance, volume_pass, view_pass } = seconds;
-    let source_radiance = source_radiance + prepared;
-    let seconds = vec![("source_radiance", source_radiance), ("volume_pass", volume_pass), ("view_pass", view_pass)];
-    Image { film, standard_error: None, seconds, figures: json!({}) }
 }

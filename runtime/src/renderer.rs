@@ -228,16 +228,16 @@ impl Renderer {
     pub fn render(&mut self, camera: &Camera) -> Result<(Film, Seconds), RenderError> {
         let mut seconds = Seconds::default();
         let start = Instant::now();
-        let Some((lit, shaded)) = self.lit()? else {
+        let Some(lit) = self.lit()? else {
             return Ok((Film::new(camera.width, camera.height), seconds));
         };
         seconds.source_radiance = start.elapsed().as_secs_f64();
         let start = Instant::now();
         let still_good = |eye: DVec3| eye == camera.position || !lit.source.depends_on_view();
         let volume = lit.volume.get_or_insert_with(|| ShadedVolume::of(lit.field));
-        if !shaded.is_some_and(still_good) {
+        if !lit.shaded.is_some_and(still_good) {
             lit.source.shade(lit.field, camera.position, volume);
-            *shaded = Some(camera.position);
+            *lit.shaded = Some(camera.position);
         }
         seconds.volume_pass = start.elapsed().as_secs_f64();
         let start = Instant::now();
@@ -247,7 +247,7 @@ impl Renderer {
     }
 
     /// Solves for the source radiance, if an edit has dropped it. None before any frame.
-    pub(crate) fn lit(&mut self) -> Result<Option<LitAndShaded<'_>>, RenderError> {
+    pub(crate) fn lit(&mut self) -> Result<Option<Lit<'_>>, RenderError> {
         let Some(loaded) = &mut self.loaded else { return Ok(None) };
         if self.source.is_none() {
             let beams = match self.settings.route {
@@ -260,17 +260,17 @@ impl Renderer {
         let peak = (medium.peak_ratio != [1.0; 3]).then_some((self.medium.g, self.settings.sh_order));
         let sky = self.sky.get_or_insert_with(|| Sky::new(&self.lights, peak));
         let (field, volume, march) = (&loaded.frame.field, &mut loaded.volume, &self.settings.march);
-        Ok(Some((Lit { field, volume, source: source.as_ref(), medium, sky, march }, &mut self.shaded)))
+        let shaded = &mut self.shaded;
+        Ok(Some(Lit { field, volume, shaded, source: source.as_ref(), medium, sky, march }))
     }
 }
 
-/// What passes after the solution need, and the eye that the volume is shaded for, if it is.
-pub(crate) type LitAndShaded<'a> = (Lit<'a>, &'a mut Option<DVec3>);
-
-/// A frame under its lights.
+/// A frame under its lights: what the passes after the solution need.
 pub(crate) struct Lit<'a> {
     pub(crate) field: &'a DensityField,
     pub(crate) volume: &'a mut Option<ShadedVolume>,
+    /// The eye that the volume is shaded for, if it is.
+    pub(crate) shaded: &'a mut Option<DVec3>,
     pub(crate) source: &'a dyn SourceRadiance,
     pub(crate) medium: &'a MarchMedium,
     pub(crate) sky: &'a Sky,

@@ -8,6 +8,7 @@
 use crate::medium::field::DensityField;
 use glam::DAffine3;
 use rayon::prelude::*;
+use std::ops::Range;
 
 /// Cells along a side of a brick.
 pub(crate) const BRICK: usize = 4;
@@ -52,7 +53,8 @@ impl BrickTable {
     pub(crate) fn of(field: &DensityField) -> Self {
         let bricks = field.dims.map(|n| (n - 1).div_ceil(BRICK));
         let count: usize = bricks.iter().product();
-        let is_dense = |b: &u32| brick(field, bricks, *b).iter().any(|node| node[3] > 0.0);
+        let is_dense =
+            |b: &u32| rows(field.dims, bricks, *b).any(|(_, row)| field.values[row].iter().any(|&d| d > 0.0));
         let dense: Vec<u32> = (0..count as u32).into_par_iter().filter(is_dense).collect();
         let mut places = vec![EMPTY; count];
         dense.iter().enumerate().for_each(|(place, &b)| places[b as usize] = place as u32);
@@ -60,26 +62,30 @@ impl BrickTable {
     }
 }
 
-/// The nodes of brick `number`, black; zeros beyond the box.
-fn brick(field: &DensityField, [bx, by, _]: [usize; 3], number: u32) -> Brick {
-    let (number, dims, mut brick) = (number as usize, field.dims, [[0.0; 4]; BRICK_NODES]);
+/// The rows of nodes of brick `number`: the place of the first in the brick, and all of them in the box.
+fn rows(dims: [usize; 3], [bx, by, _]: [usize; 3], number: u32) -> impl Iterator<Item = (usize, Range<usize>)> {
+    let number = number as usize;
     let first = [number % bx, number / bx % by, number / bx / by].map(|b| b * BRICK);
     let end = [0, 1, 2].map(|a| (first[a] + SIDE).min(dims[a]));
-    for k in first[2]..end[2] {
-        for j in first[1]..end[1] {
-            let row = &field.values[dims[0] * (j + dims[1] * k)..][first[0]..end[0]];
-            let place = SIDE * (j - first[1] + SIDE * (k - first[2]));
-            brick[place..].iter_mut().zip(row).for_each(|(node, &density)| node[3] = density);
-        }
-    }
-    brick
+    let lines = (first[2]..end[2]).flat_map(move |k| (first[1]..end[1]).map(move |j| (j, k)));
+    lines.map(move |(j, k)| {
+        let start = dims[0] * (j + dims[1] * k);
+        (SIDE * (j - first[1] + SIDE * (k - first[2])), start + first[0]..start + end[0])
+    })
 }
 
 impl ShadedVolume {
     /// The bricks of a frame, black.
     pub fn of(field: &DensityField) -> Self {
         let table = BrickTable::of(field);
-        let nodes = table.dense.par_iter().map(|&number| brick(field, table.bricks, number)).collect();
+        let black = |&number: &u32| {
+            let mut brick = [[0.0; 4]; BRICK_NODES];
+            for (place, row) in rows(field.dims, table.bricks, number) {
+                brick[place..].iter_mut().zip(&field.values[row]).for_each(|(node, &density)| node[3] = density);
+            }
+            brick
+        };
+        let nodes = table.dense.par_iter().map(black).collect();
         let density_max = field.values.par_iter().copied().reduce(|| 0.0, f32::max);
         Self { dims: field.dims, nodes, table, world_from_node: field.world_from_node, density_max }
     }

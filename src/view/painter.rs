@@ -1,20 +1,17 @@
 //! Pictures of a stage by one method, one pass after the other.
 //!
 //! A painter keeps what its renderer was last told, and tells it only what is new, so that an edit costs what it must: a
-//! camera that moves is a march alone. What renders is behind [`March`], which has the calls of
-//! [`smoke_runtime::renderer::Renderer`]; another device has the same.
+//! camera that moves is a march alone.
 
 use crate::devices::Device;
+use crate::marcher::{Marcher, marcher};
 use crate::method::Method;
 use crate::staging::Stage;
 use smoke_formats::scene;
 use smoke_runtime::camera::Camera;
 use smoke_runtime::film::Film;
-use smoke_runtime::gpu::renderer::GpuRenderer;
-use smoke_runtime::light::Light;
 use smoke_runtime::medium::frame::Frame;
-use smoke_runtime::renderer::{RenderSettings, Renderer, Seconds};
-use smoke_runtime::transport::medium::MediumParameters;
+use smoke_runtime::renderer::{RenderSettings, Seconds};
 use smoke_runtime::transport::reference::{ReferenceSettings, trace};
 use std::sync::Arc;
 use std::time::Instant;
@@ -26,46 +23,8 @@ pub type Stages = Vec<(&'static str, f64)>;
 /// more, because each call builds its tables anew.
 const TRACED: [u32; 4] = [2, 2, 4, 8];
 
-/// Frame, lights, medium and camera in, image and seconds out.
-pub trait March: Send {
-    /// Another frame.
-    fn set_frame(&mut self, frame: &Frame) -> Result<(), String>;
-    /// Other lights.
-    fn set_lights(&mut self, lights: Vec<Light>) -> Result<(), String>;
-    /// Another medium.
-    fn set_medium(&mut self, medium: MediumParameters) -> Result<(), String>;
-    /// The image from `camera`.
-    fn render(&mut self, camera: &Camera) -> Result<(Film, Stages), String>;
-}
-
-/// The same calls for either.
-macro_rules! marches {
-    ($renderer:ty) => {
-        impl March for $renderer {
-            fn set_frame(&mut self, frame: &Frame) -> Result<(), String> {
-                Self::set_frame(self, frame.clone()).map_err(|e| e.to_string())
-            }
-
-            fn set_lights(&mut self, lights: Vec<Light>) -> Result<(), String> {
-                Self::set_lights(self, lights).map_err(|e| e.to_string())
-            }
-
-            fn set_medium(&mut self, medium: MediumParameters) -> Result<(), String> {
-                Self::set_medium(self, medium).map_err(|e| e.to_string())
-            }
-
-            fn render(&mut self, camera: &Camera) -> Result<(Film, Stages), String> {
-                let (film, seconds) = Self::render(self, camera).map_err(|e| e.to_string())?;
-                Ok((film, stages(&seconds)))
-            }
-        }
-    };
-}
-
-marches!(Renderer);
-marches!(GpuRenderer);
-
-fn stages(&Seconds { source_radiance, volume_pass, view_pass }: &Seconds) -> Stages {
+/// Stages as the panel names them.
+fn stages(Seconds { source_radiance, volume_pass, view_pass }: Seconds) -> Stages {
     vec![("source radiance", source_radiance), ("volume pass", volume_pass), ("view pass", view_pass)]
 }
 
@@ -78,17 +37,6 @@ pub fn name_of(device: &Device) -> String {
         }
         Device::Gpu(_) => device.name().to_owned(),
     }
-}
-
-/// What renders on a device.
-fn marcher(device: &Device, settings: RenderSettings, stage: &Stage) -> Result<Box<dyn March>, String> {
-    let (medium, lights) = (stage.medium, stage.lights.clone());
-    Ok(match device {
-        Device::Cpu => Box::new(Renderer::new(settings, medium, lights).map_err(|e| e.to_string())?),
-        Device::Gpu(gpu) => {
-            Box::new(GpuRenderer::new(gpu.clone(), settings, medium, lights).map_err(|e| e.to_string())?)
-        }
-    })
 }
 
 /// One pass of a picture.
@@ -104,7 +52,7 @@ pub struct Pass {
 /// What a renderer was last told.
 struct Told {
     settings: RenderSettings,
-    marcher: Box<dyn March>,
+    marcher: Box<dyn Marcher>,
     up: scene::UpAxis,
     lights: Vec<scene::Light>,
     medium: scene::Medium,
@@ -137,9 +85,9 @@ impl Painter {
             Method::Compensated(settings) | Method::Transfer(settings) => {
                 // A renderer that refused something holds a mixture: the next picture begins anew.
                 let mut told = self.tell(*settings, stage, frame)?;
-                let (film, stages) = told.marcher.render(camera)?;
+                let (film, seconds) = told.marcher.render(camera)?;
                 self.told = Some(told);
-                Ok(Pass { film, weight: 1, stages })
+                Ok(Pass { film, weight: 1, stages: stages(seconds) })
             }
             Method::Reference(settings) => {
                 let start = Instant::now();
@@ -157,7 +105,7 @@ impl Painter {
         let scene = &stage.scene;
         let Some(mut told) = self.told.take().filter(|told| told.settings == settings) else {
             let mut marcher = marcher(&self.device, settings, stage)?;
-            marcher.set_frame(frame)?;
+            marcher.set_frame(Frame::clone(frame))?;
             let (lights, medium) = (scene.lights.clone(), scene.medium.clone());
             return Ok(Told { settings, marcher, up: scene.up, lights, medium, frame: frame.clone() });
         };
@@ -170,7 +118,7 @@ impl Painter {
             (told.lights, told.up) = (scene.lights.clone(), scene.up);
         }
         if !Arc::ptr_eq(&told.frame, frame) {
-            told.marcher.set_frame(frame)?;
+            told.marcher.set_frame(Frame::clone(frame))?;
             told.frame = frame.clone();
         }
         Ok(told)

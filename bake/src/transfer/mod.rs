@@ -23,6 +23,7 @@ use smoke_runtime::transport::medium::MediumParameters;
 use smoke_runtime::transport::transfer::cells::Cells;
 use smoke_runtime::transport::transfer::lit_nodes::lit_nodes;
 use std::ops::Range;
+use std::sync::Arc;
 use std::time::Instant;
 use visibility::visibility;
 
@@ -152,7 +153,10 @@ pub fn bake_run(
     let (extinctions, _) = settings.extinctions();
     let sweeps = (2 * extinctions.len() * fields.len() * basis.areas().len()) as u64;
     let swept = std::sync::atomic::AtomicU64::new(0);
-    let rows: Vec<usize> = fields.iter().map(|field| lit_nodes(field).len()).collect();
+    let lit: Vec<Vec<u32>> = fields.iter().map(|field| lit_nodes(field)).collect();
+    let rows: Vec<usize> = lit.iter().map(Vec::len).collect();
+    // For each extinction, what is seen of the nodes of each field.
+    let mut seen: Vec<Vec<Vec<f32>>> = Vec::new();
     for &sigma_t in &extinctions {
         let start = Instant::now();
         let done = |sweeps_done: u64| {
@@ -164,17 +168,17 @@ pub fn bake_run(
         out.seconds.peak_bytes = out.seconds.peak_bytes.max(4 * reduced.rows.len() as u64);
         let start = Instant::now();
         observe(Stage::Compress, 0, 1);
-        let of_nodes = |field: &&DensityField| {
-            let seen = seen_of_nodes(field, sigma_t);
-            lit_nodes(field).into_iter().map(move |node| seen[node as usize])
-        };
-        let weights = weights(fields.iter().flat_map(of_nodes));
-        out.direct.push(shared(&reduced, basis.areas().len(), &rows, &weights, settings));
+        let of_fields: Vec<Vec<f32>> = fields.iter().map(|field| seen_of_nodes(field, sigma_t)).collect();
+        let of_nodes = lit.iter().zip(&of_fields).flat_map(|(lit, seen)| lit.iter().map(|&node| seen[node as usize]));
+        out.direct.push(shared(&reduced, basis.areas().len(), &rows, &weights(of_nodes), settings));
+        seen.push(of_fields);
         out.seconds.compress += start.elapsed().as_secs_f64();
     }
     let cells: Vec<Cells> = fields.iter().map(|field| Cells::new(field, settings.shift)).collect();
     for medium in settings.media().0 {
-        indirect(fields, &cells, indirect_basis, medium, settings, rank(1), observe, &mut out);
+        let of_extinction = extinctions.iter().zip(&seen).find(|(sigma_t, _)| **sigma_t == medium.sigma_t);
+        let seen = of_extinction.map_or(&[][..], |(_, seen)| seen);
+        indirect(fields, &cells, seen, indirect_basis, medium, settings, rank(1), observe, &mut out);
     }
     let numbers = |frame: usize| {
         let nodes = out.direct.first().map_or(0, |d| d.frames[frame].0.len()) * basis.areas().len() * out.direct.len();
@@ -190,6 +194,7 @@ pub fn bake_run(
 fn indirect(
     fields: &[&DensityField],
     cells: &[Cells],
+    seen: &[Vec<f32>],
     basis: &LightBasis,
     medium: GreyMedium,
     settings: &TransferSettings,
@@ -213,12 +218,12 @@ fn indirect(
     let columns: Vec<Range<usize>> = parts.iter().map(|p| p.start * n..p.end * n).collect();
     let flown = std::sync::atomic::AtomicU64::new(0);
     let passes = if parts.len() > 1 { 2 } else { 1 };
-    let mut kept: Option<Vec<f32>> = None;
+    let mut kept: Option<Arc<Vec<f32>>> = None;
     let (mut seconds, mut truncated, mut counted) = (0.0, 0.0f64, 0);
     let start = Instant::now();
-    let mut trace = |part: usize| -> Result<Vec<f32>, std::convert::Infallible> {
+    let trace = |part: usize| -> Arc<Vec<f32>> {
         if let Some(values) = &kept {
-            return Ok(values.clone());
+            return values.clone();
         }
         let start = Instant::now();
         let mut values = Vec::with_capacity(total * parts[part].len() * n);
@@ -237,21 +242,21 @@ fn indirect(
                 *v *= medium.albedo * medium.g.powi(BAND[lm] as i32);
             }
         }
+        let values = Arc::new(values);
         if parts.len() == 1 {
             kept = Some(values.clone());
         }
         seconds += start.elapsed().as_secs_f64();
-        Ok(values)
+        values
     };
-    let Ok(reduced) = sketch(total, lights * n, rank, &columns, &mut trace);
+    let reduced = sketch(total, lights * n, rank, &columns, trace);
     observe(Stage::Compress, 0, 1);
     let widest = parts.iter().map(|p| p.len()).max().unwrap_or(0);
     let peak = 4 * (2 * total * widest * n + total * rank) as u64;
     out.seconds.peak_bytes = out.seconds.peak_bytes.max(peak);
     let of_cells =
-        |(field, cells): (&&DensityField, &Cells)| seen_of_cells(&seen_of_nodes(field, medium.sigma_t), field, cells);
-    let weights = weights(fields.iter().zip(cells).flat_map(of_cells));
-    out.indirect.push(shared(&reduced, lights * n, &rows, &weights, settings));
+        seen.iter().zip(fields).zip(cells).flat_map(|((seen, field), cells)| seen_of_cells(seen, field, cells));
+    out.indirect.push(shared(&reduced, lights * n, &rows, &weights(of_cells), settings));
     out.photons += counted;
     out.truncated = out.truncated.max(truncated);
     out.seconds.photons += seconds;

@@ -11,6 +11,7 @@
 use nalgebra::{DMatrix, SymmetricEigen};
 use smoke_runtime::product::{add_product, add_transposed, gram};
 use smoke_runtime::tracking::sampler::mix;
+use std::sync::Arc;
 
 /// Short rows, and what they are short for.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -65,17 +66,17 @@ const OVERSAMPLING: usize = 16;
 
 /// The short rows of a matrix of `rows` rows of `length` numbers that comes in parts of its columns: `parts` are ranges
 /// of columns in order, and `part(i)` gives part i, `[row][its columns]`, the same every time; it is asked for each twice.
-pub fn sketch<E>(
+pub fn sketch(
     rows: usize,
     length: usize,
     rank: usize,
     parts: &[std::ops::Range<usize>],
-    mut part: impl FnMut(usize) -> Result<Vec<f32>, E>,
-) -> Result<Reduced, E> {
+    mut part: impl FnMut(usize) -> Arc<Vec<f32>>,
+) -> Reduced {
     let wide = (rank + OVERSAMPLING).min(rows).min(length);
     let (mut sketch, mut energy) = (vec![0.0f32; rows * wide], 0.0f64);
     for (i, columns) in parts.iter().enumerate() {
-        let values = part(i)?;
+        let values = part(i);
         // Signs at random are as good as normal numbers.
         let signs: Vec<f32> = columns
             .clone()
@@ -92,7 +93,7 @@ pub fn sketch<E>(
     let found = span.len().checked_div(rows).unwrap_or(0);
     let mut back = vec![0.0f32; length * found];
     for (i, columns) in parts.iter().enumerate() {
-        let values = part(i)?;
+        let values = part(i);
         let out = &mut back[columns.start * found..columns.end * found];
         add_transposed(out, &values, &span, columns.len(), found);
     }
@@ -109,7 +110,7 @@ pub fn sketch<E>(
     short.chunks_exact_mut(rank.max(1)).for_each(|row| row.iter_mut().zip(&scales).for_each(|(v, s)| *v *= s));
     let directions =
         (0..rank * length).map(|at| turned[at % length * rank + at / length] / scales[at / length]).collect();
-    Ok(Reduced { rank, rows: short, directions, energy })
+    Reduced { rank, rows: short, directions, energy }
 }
 
 /// Orthonormal columns that span those of `matrix` (`[row][width]`), without those that are not there.
@@ -163,7 +164,7 @@ mod tests {
             matrix.chunks(length).flat_map(|row| row[columns.clone()].to_vec()).collect()
         };
         for parts in [vec![0..120], vec![0..50, 50..51, 51..120]] {
-            let reduced = sketch(count, length, 8, &parts, |i| Ok::<_, ()>(cut(parts[i].clone()))).unwrap();
+            let reduced = sketch(count, length, 8, &parts, |i| Arc::new(cut(parts[i].clone())));
             let back = rebuilt(&reduced, length);
             let worst = matrix.iter().zip(&back).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
             // Squares of f32 numbers keep singular values down to 1e-6 of the largest, about 1e-6 of numbers up to 1.
@@ -176,7 +177,7 @@ mod tests {
         let (count, length) = (200, 90);
         let matrix = rows(count, length, 0.05);
         let parts = [0..length];
-        let reduced = sketch(count, length, 3, &parts, |_| Ok::<_, ()>(matrix.clone())).unwrap();
+        let reduced = sketch(count, length, 3, &parts, |_| Arc::new(matrix.clone()));
         let back = rebuilt(&reduced, length);
         let left: f64 = matrix.iter().zip(&back).map(|(a, b)| f64::from(a - b).powi(2)).sum();
         let whole: f64 = matrix.iter().map(|v| f64::from(*v).powi(2)).sum();
@@ -194,7 +195,7 @@ mod tests {
         let matrix = rows(400, 60, 0.02);
         let sampled = of_sample(&matrix, 60, 10);
         let parts = [0..60];
-        let sketched = sketch(400, 60, 10, &parts, |_| Ok::<_, ()>(matrix.clone())).unwrap();
+        let sketched = sketch(400, 60, 10, &parts, |_| Arc::new(matrix.clone()));
         for directions in [&sampled, &sketched.directions] {
             for i in 0..10 {
                 for j in 0..10 {
@@ -211,7 +212,7 @@ mod tests {
     fn zeros_and_nothing_at_all_have_no_directions() {
         for (count, length) in [(0, 7), (5, 7)] {
             let parts = [0..length];
-            let reduced = sketch(count, length, 4, &parts, |_| Ok::<_, ()>(vec![0.0; count * length])).unwrap();
+            let reduced = sketch(count, length, 4, &parts, |_| Arc::new(vec![0.0; count * length]));
             assert_eq!((reduced.rank, reduced.error()), (0, 0.0));
         }
         assert!(of_sample(&[0.0; 21], 7, 3).is_empty());

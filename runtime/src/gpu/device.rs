@@ -247,12 +247,12 @@ impl Gpu {
         match error {
             None => done,
             Some(wgpu::Error::OutOfMemory { .. }) => Err(GpuError::OutOfMemory { stage }),
-            Some(other) => Err(GpuError::Failed { stage, reason: first_line(&other.to_string()) }),
+            Some(other) => Err(GpuError::Failed { stage, reason: one_line(&other.to_string()) }),
         }
     }
 }
 
-fn first_line(text: &str) -> String {
+fn one_line(text: &str) -> String {
     text.split_whitespace().collect::<Vec<_>>().join(" ")
 }
 

@@ -96,10 +96,10 @@ impl GpuRenderer {
     pub fn render(&mut self, camera: &Camera) -> Result<(Film, Seconds), GpuRenderError> {
         let mut seconds = Seconds::default();
         let start = Instant::now();
-        let Some((lit, _)) = self.solver.lit()? else {
+        let Some(lit) = self.solver.lit()? else {
             return Ok((Film::new(camera.width, camera.height), seconds));
         };
-        let Lit { field, volume: shaded, source, medium, sky, march } = lit;
+        let Lit { field, volume: shaded, source, medium, sky, march, .. } = lit;
         let gpu = &*self.gpu;
         if let (None, Some(grid)) = (&self.source, source.as_grid()) {
             self.source = Some(DeviceSource::new(gpu, grid)?);

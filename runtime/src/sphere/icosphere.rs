@@ -16,9 +16,8 @@ pub const MAX_LEVEL: u32 = 4;
 pub struct Icosphere {
     level: u32,
     directions: Vec<DVec3>,
-    /// The triangles of every level, coarsest first; children 4t .. 4t + 4 of triangle t are on the next.
-    levels: Vec<Vec<[u32; 3]>>,
-    /// For each level and triangle `abc`, `b x c`, `c x a`, `a x b`: how far inside a direction is of the sides across from
+    triangles: Vec<[u32; 3]>,
+    /// For each level, coarsest first, and triangle `abc`, whose children are 4t .. 4t + 4 of the next: `b x c`, `c x a`, `a x b`: how far inside a direction is of the sides across from
     /// a, b, c, and its place between them once their sum is made 1.
     sides: Vec<Vec<[DVec3; 3]>>,
     /// Directions to the middles of the icosahedron's triangles.
@@ -56,7 +55,8 @@ impl Icosphere {
         let middle = |triangle: &[u32; 3]| triangle.iter().map(|&n| directions[n as usize]).sum::<DVec3>().normalize();
         let middles = levels[0].iter().map(middle).collect();
         let sides = levels.iter().map(|triangles| triangles.iter().map(sides).collect()).collect();
-        Self { level, directions, levels, sides, middles }
+        let triangles = levels.pop().unwrap_or_default();
+        Self { level, directions, triangles, sides, middles }
     }
 
     /// The level with `nodes` nodes, if there is one.
@@ -76,7 +76,7 @@ impl Icosphere {
 
     /// The triangles of the finest level: three nodes each, counter-clockwise seen from outside.
     pub fn triangles(&self) -> &[[u32; 3]] {
-        &self.levels[self.levels.len() - 1]
+        &self.triangles
     }
 
     /// The triangle that holds a unit direction; one of both on a common side.
