@@ -261,24 +261,62 @@ layout! {
     }
 }
 
+layout! {
+    /// Sums of Gaussians: members as `gaussian_sum.wgsl` describes them.
+    GaussianSum {
+        /// Voxels of the box.
+        dims: [u32; 4],
+        /// Bricks of 8^3 voxels along each axis.
+        bricks: [u32; 4],
+        /// Gaussians.
+        count: u32,
+        /// Nothing.
+        pad_0: u32,
+        /// Nothing.
+        pad_1: u32,
+        /// Nothing.
+        pad_2: u32,
+    }
+}
+
+layout! {
+    /// The residual: members as `decoder.wgsl` describes them.
+    Decoder {
+        /// Voxels of the box.
+        dims: [u32; 4],
+        /// Bricks of 8^3 voxels along each axis.
+        bricks: [u32; 4],
+        /// Density of a code of 1.
+        step: f32,
+        /// 0 none, 1 ranks, 2 a hash.
+        kind: u32,
+        /// Which frame of a hash.
+        frame: u32,
+        /// Nothing.
+        pad: u32,
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::gpu::pass::PRELUDE;
-    use crate::gpu::{march, transfer, volume_pass};
+    use crate::gpu::{decode, march, transfer, volume_pass};
     use naga::TypeInner;
 
-    const SHADERS: [(&str, &str); 6] = [
+    const SHADERS: [(&str, &str); 8] = [
         ("march.wgsl", march::SHADER),
         ("route.wgsl", volume_pass::SHADER),
         ("product.wgsl", transfer::PRODUCT),
         ("view_directions.wgsl", transfer::VIEW_DIRECTIONS),
         ("cells.wgsl", transfer::CELLS),
         ("source.wgsl", transfer::SOURCE),
+        ("gaussian_sum.wgsl", decode::GAUSSIAN_SUM),
+        ("decoder.wgsl", decode::DECODER),
     ];
     type Members = &'static [(&'static str, usize, usize)];
     /// Every structure of every shader.
-    const LAYOUTS: [(&str, usize, Members); 8] = [
+    const LAYOUTS: [(&str, usize, Members); 10] = [
         ("March", size_of::<March>(), March::MEMBERS),
         ("Pixel", size_of::<Pixel>(), Pixel::MEMBERS),
         ("Environment", size_of::<Environment>(), Environment::MEMBERS),
@@ -287,6 +325,8 @@ mod tests {
         ("ViewDirections", size_of::<ViewDirections>(), ViewDirections::MEMBERS),
         ("Cells", size_of::<Cells>(), Cells::MEMBERS),
         ("Transfer", size_of::<Transfer>(), Transfer::MEMBERS),
+        ("GaussianSum", size_of::<GaussianSum>(), GaussianSum::MEMBERS),
+        ("Decoder", size_of::<Decoder>(), Decoder::MEMBERS),
     ];
 
     fn parse(name: &str, text: &str) -> naga::Module {

@@ -6,6 +6,7 @@
 //! On the device: the view pass, the volume pass of the grid route, and the light and view of transfer. On the processor:
 //! decoding, sweeps, GMRES.
 
+pub mod decode;
 pub mod device;
 pub mod layouts;
 pub mod march;
