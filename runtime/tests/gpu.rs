@@ -19,9 +19,9 @@ use smoke_runtime::medium::field::DensityField;
 use smoke_runtime::medium::frame::Frame;
 use smoke_runtime::renderer::{RenderSettings, Renderer};
 use smoke_runtime::shaded_volume::ShadedVolume;
+use smoke_runtime::transport::ScatteringOrder;
 use smoke_runtime::transport::compensated::grid::route::{GridSettings, GridSource, GridTransport};
 use smoke_runtime::transport::medium::MediumParameters;
-use smoke_runtime::transport::ScatteringOrder;
 use std::sync::Arc;
 
 /// Relative RMSE of images: what the device is promised to keep.

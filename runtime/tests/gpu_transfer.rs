@@ -79,17 +79,13 @@ fn coloured(g: f32) -> MediumParameters {
     MediumParameters { sigma_t: [6.0, 8.0, 6.0], albedo: [0.95, 0.9, 0.7], g }
 }
 
-/// Largest difference over the largest expected; infinite if any is not a number.
+/// Largest difference over the largest expected; infinite where one is not a number.
 fn worst<T: Copy + Into<f64>>(expected: &[T], found: &[f32]) -> f64 {
     assert_eq!(expected.len(), found.len());
     let largest = expected.iter().fold(0.0f64, |m, &e| m.max(e.into().abs()));
     assert!(largest > 0.0, "nothing to compare");
     let off = |(&e, &f): (&T, &f32)| (e.into() - f64::from(f)).abs() / largest;
-    expected.iter().zip(found).map(off).fold(0.0, |m, d| if d.is_nan() || d > m { d } else { m })
-}
-
-fn agrees(off: f64, tolerance: f64) -> bool {
-    off <= tolerance
+    expected.iter().zip(found).map(off).fold(0.0, |m, d| m.max(if d.is_nan() { f64::INFINITY } else { d }))
 }
 
 /// The transport of `field` and a pass from `texts`, ready to be compared.
@@ -136,7 +132,8 @@ impl<'a> Case<'a> {
         let sum = |row: &[f32]| {
             [0, 1, 2].map(|c| {
                 let is_used = transfer.direct_of_channel[c] == set;
-                let terms = light.iter().zip(transfer.basis.areas()).zip(row).map(|((s, a), r)| s[c] * a * f64::from(*r));
+                let terms =
+                    light.iter().zip(transfer.basis.areas()).zip(row).map(|((s, a), r)| s[c] * a * f64::from(*r));
                 if is_used { terms.sum::<f64>() * scattered * f64::from(transfer.medium.albedo[c]) } else { 0.0 }
             })
         };
@@ -159,7 +156,8 @@ impl<'a> Case<'a> {
         let found = volume.read(gpu).unwrap();
 
         let direct = if transfer.medium.g == 0.0 { transfer.direct.len() } else { 0 };
-        let truths = (0..direct).map(|set| self.even(set)).chain((0..transfer.indirect.len()).map(|set| self.moments(set)));
+        let truths =
+            (0..direct).map(|set| self.even(set)).chain((0..transfer.indirect.len()).map(|set| self.moments(set)));
         let lit = light.read(gpu, &frame).unwrap();
         assert_eq!(lit.len(), direct + transfer.indirect.len());
         let pairs = lit.iter().zip(truths);
@@ -167,7 +165,11 @@ impl<'a> Case<'a> {
 
         let cells = Cells::new(field, transfer.shift);
         let sent = frame.read_cells(gpu, cells.len()).unwrap();
-        [lit, worst(self.cells(&cells, eye).as_flattened(), &three(&sent)), worst(expected.as_flattened(), found.as_flattened())]
+        [
+            lit,
+            worst(self.cells(&cells, eye).as_flattened(), &three(&sent)),
+            worst(expected.as_flattened(), found.as_flattened()),
+        ]
     }
 
     /// What each cell sends towards `eye`, by its definition in f64.
@@ -179,7 +181,8 @@ impl<'a> Case<'a> {
             let moments = self.moments(s);
             for (cell, out) in out.iter_mut().enumerate() {
                 let brick = cells.bricks[cell] as usize;
-                let at = [brick % bx, brick / bx % by, brick / bx / by].map(|b| (b as f64 + 0.5) * f64::from(1 << cells.shift));
+                let at = [brick % bx, brick / bx % by, brick / bx / by]
+                    .map(|b| (b as f64 + 0.5) * f64::from(1 << cells.shift));
                 let way = (self.field.world_from_node.transform_point3(DVec3::from_array(at)) - eye).normalize();
                 let y = evaluate(transfer.bands, way.as_vec3());
                 let first = usize::from(set.ids[cell]) * (1 + set.terms) * n;
@@ -206,6 +209,7 @@ fn clusters_cells_and_nodes_are_the_same_on_both_sides_for_any_eye_and_in_parts(
     // Views in parts; and rows and bricks.
     let [few_views, few_rows] = [60 << 10, 800 << 10].map(|bytes| ForcedLimits { storage_binding: Some(bytes) });
     let whole = ForcedLimits::default();
+    assert!(lit_nodes(&plume(2)).len() * 4 * 5 > 800 << 10);
     let mut cases = 0;
     for (forced, fields) in [(whole, vec![plume(2), tiny()]), (few_views, vec![tiny()]), (few_rows, vec![plume(2)])] {
         let Some(gpu) = device(forced) else { return };
@@ -220,8 +224,11 @@ fn clusters_cells_and_nodes_are_the_same_on_both_sides_for_any_eye_and_in_parts(
                 let case = Case::new(&gpu, TEXTS, field.clone(), medium, terms);
                 for camera in cameras(&case.field) {
                     let [lit, cells, nodes] = case.differences(camera.position);
-                    eprintln!("{:?}, {medium:?}: clusters {lit:.1e}, cells {cells:.1e}, nodes {nodes:.1e}", case.field.dims);
-                    assert!(agrees(lit, LIT) && agrees(cells, LIT) && agrees(nodes, NODE), "{lit} {cells} {nodes}");
+                    eprintln!(
+                        "{:?}, {medium:?}: clusters {lit:.1e}, cells {cells:.1e}, nodes {nodes:.1e}",
+                        case.field.dims
+                    );
+                    assert!(lit <= LIT && cells <= LIT && nodes <= NODE, "{lit} {cells} {nodes}");
                     cases += 1;
                 }
             }
@@ -240,7 +247,7 @@ fn an_eye_on_the_diagonals_of_the_box_and_on_a_node_sees_every_node() {
     for eye in [[-5.0; 3], [4.0, 4.0, -3.0], [3.0; 3], [0.1, 0.1, 0.1], [1e3, 1e3, 0.0]] {
         let [_, _, nodes] = case.differences(DVec3::from_array(eye));
         eprintln!("{eye:?}: {nodes:.1e}");
-        assert!(agrees(nodes, NODE), "{eye:?}: {nodes}");
+        assert!(nodes <= NODE, "{eye:?}: {nodes}");
     }
     told(5);
 }
@@ -272,7 +279,7 @@ fn a_difference_planted_in_a_shader_of_transfer_is_found_by_the_comparison_of_it
         let case = Case::new(&gpu, texts.each_ref().map(String::as_str), tiny(), coloured(g), 2);
         let off = case.differences(eye)[stage];
         eprintln!("{from} -> {to}: {off:.1e}");
-        assert!(!agrees(off, [LIT, LIT, NODE][stage]), "{from}: {off}");
+        assert!(off > [LIT, LIT, NODE][stage], "{from}: {off}");
         cases += 1;
     }
     told(cases);
@@ -293,15 +300,16 @@ fn images_by_transfer_agree_after_every_kind_of_edit() {
     for medium in [grey(0.0), coloured(0.5)] {
         let mut cpu = Renderer::new(settings, medium, sky()).unwrap();
         let mut device = GpuRenderer::new(Arc::clone(&gpu), settings, medium, sky()).unwrap();
-        let mut same = |cpu: &mut Renderer, device: &mut GpuRenderer, field: &DensityField, camera: usize, what: &str| {
-            let camera = &cameras(field)[camera];
-            let (expected, a) = cpu.render(camera).unwrap();
-            let (found, b) = device.render(camera).unwrap();
-            let off = difference(&radiance(&expected), &radiance(&found));
-            eprintln!("{what}: {off:.1e}; {a:?}, {b:?}");
-            assert!(agrees(off, IMAGE), "{what}: {off}");
-            cases += 1;
-        };
+        let mut same =
+            |cpu: &mut Renderer, device: &mut GpuRenderer, field: &DensityField, camera: usize, what: &str| {
+                let camera = &cameras(field)[camera];
+                let (expected, a) = cpu.render(camera).unwrap();
+                let (found, b) = device.render(camera).unwrap();
+                let off = difference(&radiance(&expected), &radiance(&found));
+                eprintln!("{what}: {off:.1e}; {a:?}, {b:?}");
+                assert!(off <= IMAGE, "{what}: {off}");
+                cases += 1;
+            };
         for field in [plume(6), tiny()] {
             cpu.set_frame(frame(field.clone(), medium)).unwrap();
             device.set_frame(frame(field.clone(), medium)).unwrap();

@@ -49,9 +49,8 @@ fn placed(frame: &Coded) -> Vec<[u32; 4]> {
     let mut out = Vec::with_capacity(2 * frame.gaussians.len());
     for g in frame.gaussians {
         let radius = f64::from(g.radius) / frame.unit.scale;
-        let at = [0, 1, 2].map(|a| {
-            (f64::from(g.center[a]) - frame.unit.offset[a]) / frame.unit.scale - f64::from(frame.origin[a])
-        });
+        let at = [0, 1, 2]
+            .map(|a| (f64::from(g.center[a]) - frame.unit.offset[a]) / frame.unit.scale - f64::from(frame.origin[a]));
         let reach = f64::from(SUPPORT_RADII) * radius;
         let meets = |a: usize| at[a] + reach >= 0.0 && at[a] - reach <= f64::from(frame.dims[a]);
         if !(0..3).all(meets) {
@@ -112,8 +111,7 @@ impl DecodePass {
         let sums = [(0, &sum), (1, &gaussians_there), (2, &density)];
         let codes = [(0, &decoder), (1, &residual), (2, &density)];
         // A group for each brick; a buffer of as many nodes has been found to fit, so that both are u32.
-        let mut steps =
-            vec![Step { kernel: &self.sum, buffers: &sums, threads: product(bricks) as u32 * GROUP }];
+        let mut steps = vec![Step { kernel: &self.sum, buffers: &sums, threads: product(bricks) as u32 * GROUP }];
         if decodes {
             steps.push(Step { kernel: &self.decode, buffers: &codes, threads: product(dims) as u32 });
         }

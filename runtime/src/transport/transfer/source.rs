@@ -143,7 +143,12 @@ impl TransferTransport {
     }
 
     /// The light's coefficients alone: [`SourceRadiance::prepare`] lights the clusters with them.
-    pub(crate) fn project(&mut self, field: &DensityField, lights: &[Light], scattering: ScatteringOrder) -> TransferSource {
+    pub(crate) fn project(
+        &mut self,
+        field: &DensityField,
+        lights: &[Light],
+        scattering: ScatteringOrder,
+    ) -> TransferSource {
         let transfer = self.transfer.clone();
         let basis = &transfer.basis;
         let (suns, rest): (Vec<&Light>, Vec<&Light>) =
