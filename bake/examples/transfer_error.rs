@@ -8,6 +8,7 @@
 //! pixels of `scenes/plume.toml`. Tables: `cells`, `photons`, `clusters`, `bases`; all of them by default.
 
 use glam::{DVec3, Vec3};
+use smoke_baking::transfer::at_rest::frame_transfer;
 use smoke_baking::transfer::{RunTransfer, TransferSettings, bake_run};
 use smoke_formats::{image, volume};
 use smoke_runtime::backdrop::Sky;
@@ -19,7 +20,7 @@ use smoke_runtime::shaded_volume::ShadedVolume;
 use smoke_runtime::sphere::light_basis::{BasisKind, LightBasis};
 use smoke_runtime::transport::medium::MediumParameters;
 use smoke_runtime::transport::reference::{Estimate, ReferenceSettings, trace};
-use smoke_runtime::transport::transfer::frame::{Clustered, FrameTransfer};
+use smoke_runtime::transport::transfer::frame::FrameTransfer;
 use smoke_runtime::transport::transfer::source::{TransferSettings as Dials, TransferTransport};
 use smoke_runtime::transport::{ScatteringOrder, SourceRadiance};
 use std::path::Path;
@@ -158,31 +159,9 @@ fn cases(field: &DensityField, camera: &Camera, environment: &Path) -> Vec<Case>
 }
 
 fn bake(field: &DensityField, settings: &TransferSettings) -> (RunTransfer, Arc<FrameTransfer>) {
-    let basis = Arc::new(LightBasis::new(settings.basis));
-    let indirect_basis = Arc::new(LightBasis::new(settings.basis.coarser()));
-    let run = bake_run(&[field], [&basis, &indirect_basis], settings, &|_, _, _| ());
-    let clustered = |sets: &[smoke_baking::transfer::SharedRows]| -> Vec<Clustered> {
-        sets.iter()
-            .map(|set| Clustered {
-                length: set.length,
-                terms: set.terms,
-                bases: set.bases.clone(),
-                ids: set.frames[0].0.clone(),
-                weights: set.frames[0].1.clone(),
-            })
-            .collect()
-    };
-    let transfer = FrameTransfer {
-        medium: settings.medium,
-        basis,
-        indirect_basis,
-        bands: settings.bands(),
-        shift: settings.shift,
-        direct_of_channel: settings.extinctions().1,
-        indirect_of_channel: settings.media().1,
-        direct: clustered(&run.direct),
-        indirect: clustered(&run.indirect),
-    };
+    let bases = [settings.basis, settings.basis.coarser()].map(|kind| Arc::new(LightBasis::new(kind)));
+    let run = bake_run(&[field], [&bases[0], &bases[1]], settings, &|_, _, _| ());
+    let transfer = frame_transfer(&run, settings, &bases, 0);
     (run, Arc::new(transfer))
 }
 

@@ -43,9 +43,20 @@ impl Environment {
 
     /// Unit direction, world space, of texel coordinates (`u`, `v`) in [0, 1].
     pub fn direction(&self, u: f64, v: f64) -> DVec3 {
-        let azimuth = (0.5 - u) * std::f64::consts::TAU + self.rotation;
-        let elevation = (0.5 - v) * std::f64::consts::PI;
-        let (x, y, z) = (elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin());
+        let (azimuth, elevation) = (self.azimuth(u), Self::elevation(v));
+        self.turned(elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin())
+    }
+
+    fn azimuth(&self, u: f64) -> f64 {
+        (0.5 - u) * std::f64::consts::TAU + self.rotation
+    }
+
+    fn elevation(v: f64) -> f64 {
+        (0.5 - v) * std::f64::consts::PI
+    }
+
+    /// From a world where z is up.
+    fn turned(&self, x: f64, y: f64, z: f64) -> DVec3 {
         if self.up_is_y { DVec3::new(x, z, -y) } else { DVec3::new(x, y, z) }
     }
 
@@ -122,16 +133,28 @@ impl Environment {
         let pool = self.width.div_ceil(across).max(1);
         let (columns, rows) = (self.width.div_ceil(pool), self.height.div_ceil(pool));
         let mut texels = vec![Texel::default(); columns * rows];
-        for row in 0..self.height {
-            let (top, bottom) = (row as f64 / self.height as f64, (row + 1) as f64 / self.height as f64);
-            let band = (std::f64::consts::PI * top).cos() - (std::f64::consts::PI * bottom).cos();
-            let solid_angle = band * std::f64::consts::TAU / self.width as f64;
-            for column in 0..self.width {
-                let direction = self.direction((column as f64 + 0.5) / self.width as f64, 0.5 * (top + bottom));
-                let flux = self.radiance[row * self.width + column].map(|r| f64::from(r) * solid_angle);
-                texels[row / pool * columns + column / pool].add(&Texel::new(direction, flux));
+        let across: Vec<[f64; 2]> = (0..self.width)
+            .map(|column| {
+                let azimuth = self.azimuth((column as f64 + 0.5) / self.width as f64);
+                [azimuth.cos(), azimuth.sin()]
+            })
+            .collect();
+        texels.par_chunks_mut(columns).enumerate().for_each(|(pooled, texels)| {
+            for row in pooled * pool..((pooled + 1) * pool).min(self.height) {
+                let (top, bottom) = (row as f64 / self.height as f64, (row + 1) as f64 / self.height as f64);
+                let band = (std::f64::consts::PI * top).cos() - (std::f64::consts::PI * bottom).cos();
+                let solid_angle = band * std::f64::consts::TAU / self.width as f64;
+                let elevation = Self::elevation(0.5 * (top + bottom));
+                let (level, z) = (elevation.cos(), elevation.sin());
+                let line = &self.radiance[row * self.width..][..self.width];
+                for ((texel, line), across) in texels.iter_mut().zip(line.chunks(pool)).zip(across.chunks(pool)) {
+                    for (radiance, [cosine, sine]) in line.iter().zip(across) {
+                        let flux = radiance.map(|r| f64::from(r) * solid_angle);
+                        texel.add(&Texel::new(self.turned(level * cosine, level * sine, z), flux));
+                    }
+                }
             }
-        }
+        });
         texels
     }
 }

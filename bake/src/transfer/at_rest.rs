@@ -1,9 +1,12 @@
 //! A baked run as the pack holds it: half floats with a scale for each set, and what is said of each frame.
 
-use super::{RunTransfer, SharedRows};
+use super::{RunTransfer, SharedRows, TransferSettings};
 use half::f16;
 use smoke_formats::pack::TransferFrameRecord;
 use smoke_formats::transfer::{Bases, Rows, TransferBases, TransferRows};
+use smoke_runtime::sphere::light_basis::LightBasis;
+use smoke_runtime::transport::transfer::frame::{Clustered, FrameTransfer};
+use std::sync::Arc;
 
 /// Bases of the run, and rows and record of each of its frames, which have the numbers `frames` in the pack.
 pub fn to_pack(run: &RunTransfer, frames: &[usize]) -> (TransferBases, Vec<(TransferFrameRecord, TransferRows)>) {
@@ -33,6 +36,32 @@ pub fn to_pack(run: &RunTransfer, frames: &[usize]) -> (TransferBases, Vec<(Tran
     });
     let bases = TransferBases { direct: bases(&run.direct, &direct), indirect: bases(&run.indirect, &indirect) };
     (bases, each.collect())
+}
+
+/// Frame `at` of a run as the runtime has it once it was at rest: what a pack would give. `bases` are those that it was
+/// baked for.
+pub fn frame_transfer(
+    run: &RunTransfer,
+    settings: &TransferSettings,
+    [basis, indirect_basis]: &[Arc<LightBasis>; 2],
+    at: usize,
+) -> FrameTransfer {
+    let frames: Vec<usize> = (0..run.raw_bytes.len()).collect();
+    let (bases, rows) = to_pack(run, &frames);
+    let rows = &rows[at].1;
+    let sets =
+        |bases: &[Bases], rows: &[Rows]| bases.iter().zip(rows).map(|(b, r)| Clustered::unpacked(b, r)).collect();
+    FrameTransfer {
+        medium: settings.medium,
+        basis: basis.clone(),
+        indirect_basis: indirect_basis.clone(),
+        bands: settings.bands(),
+        shift: settings.shift,
+        direct_of_channel: settings.extinctions().1,
+        indirect_of_channel: settings.media().1,
+        direct: sets(&bases.direct, &rows.direct),
+        indirect: sets(&bases.indirect, &rows.indirect),
+    }
 }
 
 /// The largest mean or weight, so that half floats hold all of them; 1 where all are zero.
@@ -69,7 +98,6 @@ fn rows(set: &SharedRows, scale: f32, at: usize) -> Rows {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use smoke_runtime::transport::transfer::frame::Clustered;
 
     #[test]
     fn rows_come_back_from_half_floats_whatever_their_size() {

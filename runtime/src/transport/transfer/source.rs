@@ -262,10 +262,18 @@ impl TransferSource {
             // What each direction q brings into each view: [q][view][channel].
             let columns = views.len() * channels.len();
             let mut light = vec![0.0f32; self.irradiance.len() * columns];
+            // The mesh's sum of p over all directions is 1 while lobes are as wide as its edges; narrower ones fall between
+            // the nodes, or on one, and are made to add up to 1 so that no light is lost or made.
+            let whole = |view: &DVec3| {
+                let sum =
+                    |(toward, area): (&DVec3, &f64)| area * f64::from(phase::value(medium.g, view.dot(*toward) as f32));
+                mesh.directions().iter().zip(transfer.basis.areas()).map(sum).sum::<f64>() as f32
+            };
+            let scales: Vec<f32> = views.par_iter().map(|view| 1.0 / whole(view).max(f32::MIN_POSITIVE)).collect();
             light.par_chunks_exact_mut(columns.max(1)).enumerate().for_each(|(q, out)| {
                 let toward = mesh.directions()[q].as_vec3();
-                for (view, out) in views.iter().zip(out.chunks_exact_mut(channels.len())) {
-                    let scattered = phase::value(medium.g, view.as_vec3().dot(toward));
+                for ((view, scale), out) in views.iter().zip(&scales).zip(out.chunks_exact_mut(channels.len())) {
+                    let scattered = scale * phase::value(medium.g, view.as_vec3().dot(toward));
                     let each = out.iter_mut().zip(&channels);
                     each.for_each(|(o, &c)| *o = scattered * medium.albedo[c] * self.irradiance[q][c]);
                 }
