@@ -162,7 +162,8 @@ mod tests {
     fn every_node_of_every_brick_is_that_of_the_field_and_again_after_another_write() {
         for dims in [[9usize, 14, 38], [2, 2, 2], [5, 6, 18], [4, 3, 33]] {
             // Two thirds of the slices in z are empty, in runs of several layers.
-            let density = |v: usize| f32::from(u8::from(v / dims[0] / dims[1] % 15 < 5 && v % 3 == 0)) * (1 + v) as f32;
+            let density =
+                |v: usize| f32::from(u8::from(v / dims[0] / dims[1] % 15 < 5 && v.is_multiple_of(3))) * (1 + v) as f32;
             let values: Vec<f32> = (0..dims.iter().product()).map(density).collect();
             let field = DensityField { dims, values: values.clone(), world_from_node: DAffine3::IDENTITY };
             let mut volume = ShadedVolume::of(&field);

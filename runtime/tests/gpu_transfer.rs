@@ -34,6 +34,12 @@ const LIT: f64 = 2e-5;
 /// which moves a place among 240 squares around by 2e-5 of a square, and as much of the difference between its corners.
 const NODE: f64 = 5e-5;
 
+/// [`NODE`], and of a narrow peak: a cosine rounded to 2 x 2^-24 is as much of the peak's base, `(1 - |g|)^2`, whose power
+/// of 3/2 it is.
+fn node(g: f32) -> f64 {
+    NODE + 3.6e-7 / f64::from(1.0 - g.abs()).powi(2)
+}
+
 /// A transfer that is made up: positive where it would be, different for each set, cluster and direction.
 fn transfer(field: &DensityField, medium: MediumParameters, terms: usize) -> FrameTransfer {
     let is_coloured = medium.sigma_t[0] != medium.sigma_t[1];
@@ -46,7 +52,9 @@ fn transfer(field: &DensityField, medium: MediumParameters, terms: usize) -> Fra
     let mut made_up = |rows: usize, length: usize, size: f32| {
         let clusters = 7;
         let each = 1 + terms;
-        let base = |at: usize, r: f32| if at / length % each == 0 { size * (0.3 + 0.7 * r) } else { size * (r - 0.5) };
+        let base = |at: usize, r: f32| {
+            if (at / length).is_multiple_of(each) { size * (0.3 + 0.7 * r) } else { size * (r - 0.5) }
+        };
         Clustered {
             length,
             terms,
@@ -214,11 +222,16 @@ fn clusters_cells_and_nodes_are_the_same_on_both_sides_for_any_eye_and_in_parts(
     for (forced, fields) in [(whole, vec![plume(2), tiny()]), (few_views, vec![tiny()]), (few_rows, vec![plume(2)])] {
         let Some(gpu) = device(forced) else { return };
         for field in fields {
-            for (medium, terms) in
-                [(grey(0.0), 4), (grey(0.5), 4), (coloured(0.5), 2), (coloured(0.0), 0), (grey(-0.7), 1)]
-            {
-                // There is no room for sixteen coefficients of four terms.
-                if forced == few_views && medium.g != 0.0 && terms == 4 {
+            for (medium, terms) in [
+                (grey(0.0), 4),
+                (grey(0.5), 4),
+                (coloured(0.5), 2),
+                (coloured(0.0), 0),
+                (grey(-0.7), 1),
+                (grey(0.95), 1),
+            ] {
+                // There is no room for sixteen coefficients of four terms, nor for the squares of a narrow peak.
+                if forced == few_views && (medium.g > 0.9 || medium.g != 0.0 && terms == 4) {
                     continue;
                 }
                 let case = Case::new(&gpu, TEXTS, field.clone(), medium, terms);
@@ -228,7 +241,7 @@ fn clusters_cells_and_nodes_are_the_same_on_both_sides_for_any_eye_and_in_parts(
                         "{:?}, {medium:?}: clusters {lit:.1e}, cells {cells:.1e}, nodes {nodes:.1e}",
                         case.field.dims
                     );
-                    assert!(lit <= LIT && cells <= LIT && nodes <= NODE, "{lit} {cells} {nodes}");
+                    assert!(lit <= LIT && cells <= LIT && nodes <= node(medium.g), "{lit} {cells} {nodes}");
                     cases += 1;
                 }
             }
@@ -247,7 +260,7 @@ fn an_eye_on_the_diagonals_of_the_box_and_on_a_node_sees_every_node() {
     for eye in [[-5.0; 3], [4.0, 4.0, -3.0], [3.0; 3], [0.1, 0.1, 0.1], [1e3, 1e3, 0.0]] {
         let [_, _, nodes] = case.differences(DVec3::from_array(eye));
         eprintln!("{eye:?}: {nodes:.1e}");
-        assert!(nodes <= NODE, "{eye:?}: {nodes}");
+        assert!(nodes <= node(0.5), "{eye:?}: {nodes}");
     }
     told(5);
 }
@@ -262,7 +275,8 @@ fn a_difference_planted_in_a_shader_of_transfer_is_found_by_the_comparison_of_it
         (0, 0, 0.5, "% product.inner;", "% product.inner * 0u;"),
         (0, 0, 0.5, "* product.channels", "* product.channels * 1.0001"),
         (1, 2, 0.5, "2.0 * g * (1.0 - mu)", "2.0 * g * (1.001 - mu)"),
-        (1, 2, 0.5, "seen.first_view + thread", "seen.first_view + 1u + thread"),
+        (1, 2, 0.5, "whole += mesh[q].w *", "whole += 1.001 * mesh[q].w *"),
+        (1, 2, 0.5, "seen.first_view + thread %", "seen.first_view + 1u + thread %"),
         (2, 1, 0.5, "+ t * n + lm", "+ n + lm"),
         (2, 1, 0.5, "vec3<f32>(cell) + 0.5", "vec3<f32>(cell) + 0.51"),
         (2, 2, 0.0, "f32(pass_.side) - 0.5;", "f32(pass_.side) - 0.49;"),
@@ -279,7 +293,7 @@ fn a_difference_planted_in_a_shader_of_transfer_is_found_by_the_comparison_of_it
         let case = Case::new(&gpu, texts.each_ref().map(String::as_str), tiny(), coloured(g), 2);
         let off = case.differences(eye)[stage];
         eprintln!("{from} -> {to}: {off:.1e}");
-        assert!(off > [LIT, LIT, NODE][stage], "{from}: {off}");
+        assert!(off > [LIT, LIT, node(g)][stage], "{from}: {off}");
         cases += 1;
     }
     told(cases);

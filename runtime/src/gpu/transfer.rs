@@ -37,6 +37,7 @@ const VIEWS: usize = 1024;
 /// The shaders of transfer, compiled.
 pub struct TransferPass {
     pub(super) multiply: Kernel,
+    pub(super) weigh: Kernel,
     pub(super) scatter: Kernel,
     pub(super) send: Kernel,
     pub(super) interpolate: Kernel,
@@ -63,7 +64,7 @@ pub struct DeviceTransfer {
     pub(super) bands: usize,
     pub(super) cells: [usize; 3],
     pub(super) side: usize,
-    /// Directions of the mesh, and how many.
+    /// Directions of the mesh with their solid angles, and how many.
     pub(super) mesh: (wgpu::Buffer, usize),
     pub(super) direct: Vec<DeviceClusters>,
     pub(super) indirect: Vec<DeviceClusters>,
@@ -121,8 +122,8 @@ impl DeviceTransfer {
         let (transfer, cells) = (&source.transfer, &source.cells);
         let mut lit_rows = vec![EMPTY; field.values.len()];
         source.nodes.iter().zip(0..).for_each(|(&node, row)| lit_rows[node as usize] = row);
-        let mesh: Vec<[f32; 4]> =
-            transfer.basis.mesh().directions().iter().map(|d| d.as_vec3().extend(0.0).to_array()).collect();
+        let mesh = transfer.basis.mesh().directions().iter().zip(transfer.basis.areas());
+        let mesh: Vec<[f32; 4]> = mesh.map(|(d, &area)| d.as_vec3().extend(area as f32).to_array()).collect();
         let limit = (gpu.summary().storage_binding.min(gpu.summary().buffer)) as usize;
         gpu.checked("transfer", || {
             let sets = |sets: &[Clustered], of_channel: [usize; 3]| {
@@ -208,6 +209,7 @@ impl TransferPass {
         let kernel = |text, entry| Kernel::new(gpu, "transfer", text, entry);
         Ok(Self {
             multiply: kernel(product, "multiply")?,
+            weigh: kernel(views, "weigh")?,
             scatter: kernel(views, "scatter")?,
             send: kernel(cells, "send")?,
             interpolate: kernel(cells, "interpolate")?,
@@ -248,7 +250,7 @@ impl TransferPass {
         let view = gpu.upload("directions from the eye", &[[0.0f32, 0.0, 1.0, 0.0]])?;
         let mut work = Vec::new();
         if let (true, Some(irradiance)) = (is_even, &light.irradiance) {
-            work.push(self.scattered(gpu, frame, irradiance, &view, (0, 1)));
+            work.extend(self.scattered(gpu, frame, irradiance, &view, (0, 1)));
         }
         for (set, lit) in frame.direct.iter().zip(&light.even) {
             work.push(self.multiplied(gpu, set, (&frame.light, 1), lit, 1));
@@ -268,16 +270,19 @@ impl TransferPass {
         irradiance: &'a wgpu::Buffer,
         views: &'a wgpu::Buffer,
         (first, count): (usize, usize),
-    ) -> Work<'a> {
+    ) -> [Work<'a>; 2] {
         let (mesh, directions) = (&frame.mesh.0, frame.mesh.1);
         let uniform =
             ViewsUniform { g: frame.g, directions: directions as u32, first_view: first as u32, views: count as u32 };
-        Work {
-            kernel: &self.scatter,
-            uniform: gpu.uniform("light of the views", &uniform),
-            buffers: vec![(1, mesh), (2, irradiance), (3, views), (4, &frame.light)],
-            threads: directions * count,
-        }
+        let uniform = gpu.uniform("light of the views", &uniform);
+        let weigh = Work {
+            kernel: &self.weigh,
+            uniform: uniform.clone(),
+            buffers: vec![(1, mesh), (3, views)],
+            threads: count,
+        };
+        let buffers = vec![(1, mesh), (2, irradiance), (3, views), (4, &frame.light)];
+        [weigh, Work { kernel: &self.scatter, uniform, buffers, threads: directions * count }]
     }
 
     /// The clusters of a set times `columns` of light.

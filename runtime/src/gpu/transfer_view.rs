@@ -71,7 +71,7 @@ impl TransferPass {
         if let (Some(seen), Some(irradiance)) = (&seen, &light.irradiance) {
             for first in (0..directions.len()).step_by(frame.views) {
                 let count = frame.views.min(directions.len() - first);
-                work.push(self.scattered(gpu, frame, irradiance, &views, (first, count)));
+                work.extend(self.scattered(gpu, frame, irradiance, &views, (first, count)));
                 for (set, lit) in frame.direct.iter().zip(&frame.lit) {
                     work.push(self.multiplied(gpu, set, (&frame.light, count), lit, 1));
                 }

@@ -289,7 +289,9 @@ impl LightBasis {
     /// solid angle that it is seen under.
     fn quadrature(&self) -> (Vec<f64>, Vec<(u32, u32, f64)>) {
         let n = AREA_POINTS;
-        let parts: Vec<([u32; 6], [f64; 6], [[f64; 6]; 6])> = (0..self.mesh.triangles().len())
+        /// Nodes of a triangle, the integrals of their functions, and those of products of two.
+        type Part = ([u32; 6], [f64; 6], [[f64; 6]; 6]);
+        let parts: Vec<Part> = (0..self.mesh.triangles().len())
             .into_par_iter()
             .map(|t| {
                 let corners = self.mesh.triangles()[t].map(|n| self.mesh.directions()[n as usize]);
