@@ -118,12 +118,12 @@ impl ViewDirections {
     }
 
     /// Squares along a side of a face.
-    pub(crate) fn squares(&self) -> usize {
+    pub fn squares(&self) -> usize {
         self.squares
     }
 
     /// For each corner of each face, `[face][row][column]`, its place in [`Self::directions`], or `u32::MAX`.
-    pub(crate) fn places(&self) -> &[u32] {
+    pub fn places(&self) -> &[u32] {
         &self.places
     }
 
