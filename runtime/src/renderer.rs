@@ -231,6 +231,7 @@ impl Renderer {
         let Some(lit) = self.lit()? else {
             return Ok((Film::new(camera.width, camera.height), seconds));
         };
+        lit.source.prepare();
         seconds.source_radiance = start.elapsed().as_secs_f64();
         let start = Instant::now();
         let still_good = |eye: DVec3| eye == camera.position || !lit.source.depends_on_view();
@@ -303,7 +304,7 @@ fn solve(
         Transport::Transfer(transport) => {
             let transfer = frame.transfer.as_ref().ok_or(RenderError::NoTransfer)?;
             check_medium(medium, &transfer.medium)?;
-            let source = transport.light(&frame.field, lights, settings.scattering);
+            let source = transport.project(&frame.field, lights, settings.scattering);
             (Box::new(source), MarchMedium::plain(medium.sigma_t))
         }
     })

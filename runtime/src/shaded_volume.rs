@@ -60,6 +60,12 @@ impl BrickTable {
         dense.iter().enumerate().for_each(|(place, &b)| places[b as usize] = place as u32);
         Self { bricks, dense, places }
     }
+
+    /// The first node of each brick with density.
+    pub(crate) fn corners(&self) -> impl Iterator<Item = [usize; 3]> {
+        let [bx, by, _] = self.bricks;
+        self.dense.iter().map(move |&b| b as usize).map(move |b| [b % bx, b / bx % by, b / bx / by].map(|b| b * BRICK))
+    }
 }
 
 /// The rows of nodes of brick `number`: the place of the first in the brick, and all of them in the box.
@@ -92,9 +98,7 @@ impl ShadedVolume {
 
     /// The first node of each brick, and how many nodes it is to the last along a side.
     pub(crate) fn corners(&self) -> (impl Iterator<Item = [usize; 3]>, usize) {
-        let [bx, by, _] = self.table.bricks;
-        let corner = move |b: usize| [b % bx, b / bx % by, b / bx / by].map(|b| b * BRICK);
-        (self.table.dense.iter().map(move |&b| corner(b as usize)), BRICK)
+        (self.table.corners(), BRICK)
     }
 
     /// Writes the radiance of all nodes anew: `row(j, k, out)` gives that of the nodes `[.., j, k]` in the first three

@@ -1,11 +1,13 @@
-//! The calls of [`Renderer`], with the volume pass of the grid route and the view pass on a device.
+//! The calls of [`Renderer`], with transfer, the volume pass of the grid route and the view pass on a device.
 //!
-//! Decoding, sweeps and the iteration for multiple scattering are the processor's, and so is the volume pass of other
-//! routes: their results are copied. Kept until an edit makes them void: planes, bricks and backdrop on the device.
+//! Decoding, sweeps and the iteration for multiple scattering are the processor's, and so is the volume pass of the route
+//! through centres: their results are copied. Kept until an edit makes them void: planes, clusters and their light, bricks
+//! and backdrop on the device.
 
 use super::device::{Gpu, GpuError};
 use super::march::{DeviceSky, MarchPass};
 use super::self_test;
+use super::transfer::{DeviceLight, DeviceTransfer, TransferPass};
 use super::volume::DeviceVolume;
 use super::volume_pass::{DeviceSource, VolumePass};
 use crate::camera::Camera;
@@ -45,6 +47,9 @@ pub struct GpuRenderer {
     volume_pass: VolumePass,
     sky: Option<DeviceSky>,
     source: Option<DeviceSource>,
+    transfer_pass: TransferPass,
+    transfer: Option<DeviceTransfer>,
+    light: Option<DeviceLight>,
     loaded: Option<Loaded>,
     /// The eye that the volume is shaded for.
     eye: Option<DVec3>,
@@ -65,8 +70,9 @@ impl GpuRenderer {
         }
         let (march, volume_pass) = (MarchPass::new(&gpu)?, VolumePass::new(&gpu)?);
         self_test::check(&gpu, &march)?;
-        let (sky, source, loaded, eye) = (None, None, None, None);
-        Ok(Self { gpu, solver, march, volume_pass, sky, source, loaded, eye })
+        let transfer_pass = TransferPass::new(&gpu)?;
+        let (sky, source, transfer, light, loaded, eye) = (None, None, None, None, None, None);
+        Ok(Self { gpu, solver, march, volume_pass, sky, source, transfer_pass, transfer, light, loaded, eye })
     }
 
     /// The device.
@@ -76,19 +82,19 @@ impl GpuRenderer {
 
     /// Another frame.
     pub fn set_frame(&mut self, frame: Frame) -> Result<(), RenderError> {
-        (self.source, self.loaded, self.eye) = (None, None, None);
+        (self.source, self.transfer, self.light, self.loaded, self.eye) = (None, None, None, None, None);
         self.solver.set_frame(frame)
     }
 
     /// Other lights.
     pub fn set_lights(&mut self, lights: Vec<Light>) -> Result<(), RenderError> {
-        (self.sky, self.source, self.eye) = (None, None, None);
+        (self.sky, self.source, self.light, self.eye) = (None, None, None, None);
         self.solver.set_lights(lights)
     }
 
     /// Another medium.
     pub fn set_medium(&mut self, medium: MediumParameters) -> Result<(), RenderError> {
-        (self.sky, self.source, self.eye) = (None, None, None);
+        (self.sky, self.source, self.light, self.eye) = (None, None, None, None);
         self.solver.set_medium(medium)
     }
 
@@ -104,18 +110,26 @@ impl GpuRenderer {
         if let (None, Some(grid)) = (&self.source, source.as_grid()) {
             self.source = Some(DeviceSource::new(gpu, grid)?);
         }
+        let transfer = source.as_transfer();
+        if let (None, Some(source)) = (&self.transfer, transfer) {
+            self.transfer = Some(DeviceTransfer::new(gpu, source, field)?);
+        }
+        if let (None, Some(source), Some(frame)) = (&self.light, transfer, &self.transfer) {
+            self.light = Some(self.transfer_pass.light(gpu, frame, source)?);
+        }
         seconds.source_radiance = start.elapsed().as_secs_f64();
         let start = Instant::now();
+        let on_device = self.source.is_some() || transfer.is_some();
         let eye = self.eye.take().filter(|&eye| eye == camera.position || !source.depends_on_view());
-        let loaded = match (self.loaded.take(), &self.source) {
+        let loaded = match (self.loaded.take(), on_device) {
             // A frame's bricks are the same under any light; others' volumes come whole from the processor.
-            (Some(loaded), Some(_)) => loaded,
-            (Some(loaded), None) if eye.is_some() => loaded,
-            (_, Some(_)) => Loaded {
+            (Some(loaded), true) => loaded,
+            (Some(loaded), false) if eye.is_some() => loaded,
+            (_, true) => Loaded {
                 volume: DeviceVolume::of_field(gpu, field)?,
                 density: gpu.upload("density of the frame", &field.values)?,
             },
-            (_, None) => {
+            (_, false) => {
                 let shaded = shaded.get_or_insert_with(|| ShadedVolume::of(field));
                 source.shade(field, camera.position, shaded);
                 let density = gpu.upload::<f32>("density of the frame", &[])?;
@@ -125,6 +139,10 @@ impl GpuRenderer {
         let loaded = self.loaded.insert(loaded);
         if let (None, Some(source)) = (eye, &self.source) {
             self.volume_pass.shade(gpu, source, (field, &loaded.density), &loaded.volume, camera.position)?;
+        }
+        if let (None, Some(light), Some(frame)) = (eye, &self.light, &self.transfer) {
+            let density = (field, &loaded.density);
+            self.transfer_pass.shade(gpu, frame, light, density, &loaded.volume, camera.position)?;
         }
         self.eye = Some(eye.unwrap_or(camera.position));
         seconds.volume_pass = start.elapsed().as_secs_f64();

@@ -21,6 +21,8 @@ pub struct DeviceVolume {
     pub bricks: [usize; 3],
     /// Bricks with density.
     pub dense: usize,
+    /// The first node of each of them.
+    pub(crate) corners: Vec<[usize; 3]>,
     /// Node to world space.
     pub world_from_node: DAffine3,
     /// Largest density.
@@ -75,6 +77,7 @@ impl DeviceVolume {
                 dims,
                 bricks: table.bricks,
                 dense,
+                corners: table.corners().collect(),
                 world_from_node,
                 density_max,
                 bricks_a_page,

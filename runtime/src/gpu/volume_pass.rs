@@ -12,7 +12,8 @@ use crate::transport::compensated::grid::route::GridSource;
 use glam::DVec3;
 
 /// The shader, without its prelude.
-pub const SHADER: &str = include_str!("../transport/compensated/grid/route.wgsl");
+pub const SHADER: &str =
+    concat!(include_str!("../sphere/harmonics.wgsl"), include_str!("../transport/compensated/grid/route.wgsl"));
 
 /// The volume pass, compiled.
 pub struct VolumePass {

@@ -9,6 +9,7 @@ use crate::medium::field::DensityField;
 use crate::shaded_volume::ShadedVolume;
 use compensated::grid::route::GridSource;
 use glam::DVec3;
+use transfer::source::TransferSource;
 
 /// Which orders of scattering are computed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -26,11 +27,19 @@ pub trait SourceRadiance: Send + Sync {
     /// True if the shaded volume must be made again when the camera moves.
     fn depends_on_view(&self) -> bool;
 
+    /// Makes now what the processor's volume pass needs of any view; [`Self::shade`] makes it where this was not called.
+    fn prepare(&self) {}
+
     /// The volume pass: source radiance towards `eye` (world space), into the volume of the same field.
     fn shade(&self, field: &DensityField, eye: DVec3, volume: &mut ShadedVolume);
 
     /// The planes of the grid route, if it is that: its volume pass has a twin on the device.
     fn as_grid(&self) -> Option<&GridSource> {
+        None
+    }
+
+    /// The transfer and its light, if it is that: clusters can be lit on the device instead.
+    fn as_transfer(&self) -> Option<&TransferSource> {
         None
     }
 }

@@ -29,7 +29,7 @@ use glam::{DVec3, Vec3, Vec4};
 use multiversion::multiversion;
 use rayon::prelude::*;
 use std::ops::Range;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 /// The dials of the method.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -68,10 +68,10 @@ pub struct TransferTransport {
 }
 
 /// What a sun brings directly: its direction, irradiance times albedo, and transmittance to each lit node, by channel.
-struct Sun {
-    toward: Vec3,
-    power: [f32; 3],
-    transmittance: [Arc<Vec<f32>>; 3],
+pub(crate) struct Sun {
+    pub(crate) toward: Vec3,
+    pub(crate) power: [f32; 3],
+    pub(crate) transmittance: [Arc<Vec<f32>>; 3],
 }
 
 /// Radiance of the clusters of one set of direct rows.
@@ -82,20 +82,22 @@ struct LitClusters {
     each_view: usize,
 }
 
-/// A lit frame.
+/// A lit frame: the light's coefficients, and the clusters that the processor has lit with them.
 pub struct TransferSource {
-    transfer: Arc<FrameTransfer>,
-    nodes: Arc<Vec<u32>>,
+    pub(crate) transfer: Arc<FrameTransfer>,
+    pub(crate) nodes: Arc<Vec<u32>>,
     /// Place in `nodes` of the first node of each line along x, and the end of the last.
     lines: Arc<Vec<u32>>,
-    cells: Arc<Cells>,
+    pub(crate) cells: Arc<Cells>,
     /// Irradiance from each direction of the mesh.
-    irradiance: Vec<[f32; 3]>,
-    suns: Vec<Sun>,
+    pub(crate) irradiance: Vec<[f32; 3]>,
+    pub(crate) suns: Vec<Sun>,
+    /// What the light brings into each function of the indirect basis.
+    pub(crate) coefficients: Vec<[f64; 3]>,
     /// `[cell][lm]`, RGB and a zero.
-    moments: Vec<Vec4>,
+    moments: OnceLock<Vec<Vec4>>,
     /// Direct radiance of each set's clusters where it is the same from everywhere.
-    even: Option<Vec<LitClusters>>,
+    even: OnceLock<Vec<LitClusters>>,
 }
 
 impl TransferTransport {
@@ -135,6 +137,18 @@ impl TransferTransport {
 
     /// Lights the frame `field`, the same as at [`Self::new`]; points count for nothing.
     pub fn light(&mut self, field: &DensityField, lights: &[Light], scattering: ScatteringOrder) -> TransferSource {
+        let source = self.project(field, lights, scattering);
+        source.prepare();
+        source
+    }
+
+    /// The light's coefficients alone: [`SourceRadiance::prepare`] lights the clusters with them.
+    pub(crate) fn project(
+        &mut self,
+        field: &DensityField,
+        lights: &[Light],
+        scattering: ScatteringOrder,
+    ) -> TransferSource {
         let transfer = self.transfer.clone();
         let basis = &transfer.basis;
         let (suns, rest): (Vec<&Light>, Vec<&Light>) =
@@ -151,21 +165,17 @@ impl TransferTransport {
             .collect();
         let suns = suns.into_iter().filter_map(|sun| self.sweep(field, sun)).collect();
         let indirect: &[Light] = if scattering == ScatteringOrder::Single { &[] } else { lights };
-        let moments = moments(&transfer, &self.cells, &transfer.indirect_basis.response_coefficients(indirect));
-        let mut source = TransferSource {
+        TransferSource {
             nodes: self.nodes.clone(),
             lines: self.lines.clone(),
             cells: self.cells.clone(),
+            coefficients: transfer.indirect_basis.response_coefficients(indirect),
             transfer,
             irradiance,
             suns,
-            moments,
-            even: None,
-        };
-        if source.transfer.medium.g == 0.0 {
-            source.even = Some(source.lit_clusters(&[DVec3::Z]));
+            moments: OnceLock::new(),
+            even: OnceLock::new(),
         }
-        source
     }
 
     fn sweep(&mut self, field: &DensityField, sun: &Light) -> Option<Sun> {
@@ -233,6 +243,15 @@ fn moments(transfer: &FrameTransfer, cells: &Cells, coefficients: &[[f64; 3]]) -
 }
 
 impl TransferSource {
+    fn moments(&self) -> &[Vec4] {
+        self.moments.get_or_init(|| moments(&self.transfer, &self.cells, &self.coefficients))
+    }
+
+    fn even(&self) -> Option<&Vec<LitClusters>> {
+        let is_even = self.transfer.medium.g == 0.0;
+        is_even.then(|| self.even.get_or_init(|| self.lit_clusters(&[DVec3::Z])))
+    }
+
     /// Radiance that each direct cluster and each of its directions sends the way that is seen along each of `views`,
     /// unit vectors from the eye, for each set.
     fn lit_clusters(&self, views: &[DVec3]) -> Vec<LitClusters> {
@@ -276,6 +295,15 @@ impl TransferSource {
 }
 
 impl SourceRadiance for TransferSource {
+    fn prepare(&self) {
+        self.moments();
+        self.even();
+    }
+
+    fn as_transfer(&self) -> Option<&TransferSource> {
+        Some(self)
+    }
+
     fn depends_on_view(&self) -> bool {
         self.transfer.medium.g != 0.0
     }
@@ -287,7 +315,8 @@ impl SourceRadiance for TransferSource {
         let across = linear.x_axis.as_vec3();
         let squares = squares(self.transfer.medium.g);
         // Where only suns shine, there is no direct light of clusters.
-        let seen = (self.even.is_none() && self.irradiance.iter().any(|e| *e != [0.0; 3])).then(|| {
+        let even = self.even();
+        let seen = (even.is_none() && self.irradiance.iter().any(|e| *e != [0.0; 3])).then(|| {
             let (corners, side) = volume.corners();
             let corners: Vec<Vec3> = corners.map(along).collect();
             let edges = [linear.x_axis, linear.y_axis, linear.z_axis].map(|edge| edge.as_vec3());
@@ -295,7 +324,7 @@ impl SourceRadiance for TransferSource {
             let lit = self.lit_clusters(directions.directions());
             (directions, lit)
         });
-        let direct = match (&self.even, &seen) {
+        let direct = match (even, &seen) {
             (Some(lit), _) => Direct::Even(lit),
             (None, Some((directions, lit))) => Direct::Seen(directions, squares, lit),
             (None, None) => Direct::None,
@@ -404,7 +433,7 @@ impl TransferSource {
             (field.world_from_node.transform_point3(DVec3::from_array(at)) - eye).normalize_or(DVec3::Z).as_vec3()
         };
         let mut out = vec![Vec4::ZERO; self.cells.len()];
-        let blocks = out.par_chunks_mut(1024).zip(self.moments.par_chunks(1024 * n));
+        let blocks = out.par_chunks_mut(1024).zip(self.moments().par_chunks(1024 * n));
         blocks.zip(self.cells.bricks.par_chunks(1024)).for_each(|((out, moments), bricks)| {
             let ways: Vec<Vec3> = bricks.iter().map(|&brick| middle(brick as usize)).collect();
             along_ways(out, moments, &ways, bands);

@@ -117,6 +117,16 @@ impl ViewDirections {
         &self.directions
     }
 
+    /// Squares along a side of a face.
+    pub fn squares(&self) -> usize {
+        self.squares
+    }
+
+    /// For each corner of each face, `[face][row][column]`, its place in [`Self::directions`], or `u32::MAX`.
+    pub fn places(&self) -> &[u32] {
+        &self.places
+    }
+
     /// Places in [`Self::directions`] of the four corners around a direction that was seen, and their weights.
     #[inline(always)]
     pub fn around(&self, between: Between) -> [(u32, f32); 4] {
