@@ -6,6 +6,7 @@
 //! On the device: the view pass, the volume pass of the grid route, the light and view of transfer; and decoding, which the
 //! renderer does not use yet. On the processor: sweeps, GMRES.
 
+pub mod centres;
 pub mod decode;
 pub mod device;
 pub mod layouts;

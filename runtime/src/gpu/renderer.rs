@@ -1,9 +1,9 @@
-//! The calls of [`Renderer`], with transfer, the volume pass of the grid route and the view pass on a device.
+//! The calls of [`Renderer`], with transfer, the volume passes and the view pass on a device.
 //!
-//! Decoding, sweeps and the iteration for multiple scattering are the processor's, and so is the volume pass of the route
-//! through centres: their results are copied. Kept until an edit makes them void: planes, clusters and their light, bricks
+//! Decoding, sweeps and the iteration for multiple scattering are the processor's: their results are copied. Kept until an edit makes them void: planes, clusters and their light, bricks
 //! and backdrop on the device.
 
+use super::centres::{CentrePass, DeviceCentres};
 use super::device::{Gpu, GpuError};
 use super::march::{DeviceSky, MarchPass};
 use super::self_test;
@@ -15,7 +15,6 @@ use crate::film::Film;
 use crate::light::Light;
 use crate::medium::frame::Frame;
 use crate::renderer::{Lit, RenderError, RenderSettings, Renderer, Seconds};
-use crate::shaded_volume::ShadedVolume;
 use crate::transport::medium::MediumParameters;
 use glam::DVec3;
 use std::sync::Arc;
@@ -47,6 +46,8 @@ pub struct GpuRenderer {
     volume_pass: VolumePass,
     sky: Option<DeviceSky>,
     source: Option<DeviceSource>,
+    centre_pass: CentrePass,
+    centres: Option<DeviceCentres>,
     transfer_pass: TransferPass,
     transfer: Option<DeviceTransfer>,
     light: Option<DeviceLight>,
@@ -71,8 +72,22 @@ impl GpuRenderer {
         let (march, volume_pass) = (MarchPass::new(&gpu)?, VolumePass::new(&gpu)?);
         self_test::check(&gpu, &march)?;
         let transfer_pass = TransferPass::new(&gpu)?;
-        let (sky, source, transfer, light, loaded, eye) = (None, None, None, None, None, None);
-        Ok(Self { gpu, solver, march, volume_pass, sky, source, transfer_pass, transfer, light, loaded, eye })
+        let centre_pass = CentrePass::new(&gpu)?;
+        Ok(Self {
+            gpu,
+            solver,
+            march,
+            volume_pass,
+            sky: None,
+            source: None,
+            centre_pass,
+            centres: None,
+            transfer_pass,
+            transfer: None,
+            light: None,
+            loaded: None,
+            eye: None,
+        })
     }
 
     /// The device.
@@ -82,20 +97,26 @@ impl GpuRenderer {
 
     /// Another frame.
     pub fn set_frame(&mut self, frame: Frame) -> Result<(), RenderError> {
-        (self.source, self.transfer, self.light, self.loaded, self.eye) = (None, None, None, None, None);
+        (self.source, self.centres, self.eye) = (None, None, None);
+        (self.transfer, self.light, self.loaded) = (None, None, None);
         self.solver.set_frame(frame)
     }
 
     /// Other lights.
     pub fn set_lights(&mut self, lights: Vec<Light>) -> Result<(), RenderError> {
-        (self.sky, self.source, self.light, self.eye) = (None, None, None, None);
+        self.unlit();
         self.solver.set_lights(lights)
     }
 
     /// Another medium.
     pub fn set_medium(&mut self, medium: MediumParameters) -> Result<(), RenderError> {
-        (self.sky, self.source, self.light, self.eye) = (None, None, None, None);
+        self.unlit();
         self.solver.set_medium(medium)
+    }
+
+    /// Drops what depends on lights and medium.
+    fn unlit(&mut self) {
+        (self.sky, self.source, self.centres, self.light, self.eye) = (None, None, None, None, None);
     }
 
     /// The image from `camera`, and the seconds it took, copies included; empty pixels before any frame.
@@ -105,10 +126,13 @@ impl GpuRenderer {
         let Some(lit) = self.solver.lit()? else {
             return Ok((Film::new(camera.width, camera.height), seconds));
         };
-        let Lit { field, volume: shaded, source, medium, sky, march, .. } = lit;
+        let Lit { field, source, medium, sky, march, .. } = lit;
         let gpu = &*self.gpu;
         if let (None, Some(grid)) = (&self.source, source.as_grid()) {
             self.source = Some(DeviceSource::new(gpu, grid)?);
+        }
+        if let (None, Some(centres)) = (&self.centres, source.as_centres()) {
+            self.centres = Some(DeviceCentres::new(gpu, centres, field)?);
         }
         let transfer = source.as_transfer();
         if let (None, Some(source)) = (&self.transfer, transfer) {
@@ -119,24 +143,20 @@ impl GpuRenderer {
         }
         seconds.source_radiance = start.elapsed().as_secs_f64();
         let start = Instant::now();
-        let on_device = self.source.is_some() || transfer.is_some();
         let eye = self.eye.take().filter(|&eye| eye == camera.position || !source.depends_on_view());
-        let loaded = match (self.loaded.take(), on_device) {
-            // A frame's bricks are the same under any light; others' volumes come whole from the processor.
-            (Some(loaded), true) => loaded,
-            (Some(loaded), false) if eye.is_some() => loaded,
-            (_, true) => Loaded {
+        // A frame's bricks are the same under any light.
+        let loaded = match self.loaded.take() {
+            Some(loaded) => loaded,
+            None => Loaded {
                 volume: DeviceVolume::of_field(gpu, field)?,
                 density: gpu.upload("density of the frame", &field.values)?,
             },
-            (_, false) => {
-                let shaded = shaded.get_or_insert_with(|| ShadedVolume::of(field));
-                source.shade(field, camera.position, shaded);
-                let density = gpu.upload::<f32>("density of the frame", &[])?;
-                Loaded { volume: DeviceVolume::of_shaded(gpu, shaded)?, density }
-            }
         };
         let loaded = self.loaded.insert(loaded);
+        if let (None, Some(device), Some(centres)) = (eye, &self.centres, source.as_centres()) {
+            let eye = centres.unit_from_world(camera.position);
+            self.centre_pass.shade(gpu, device, (field, &loaded.density), &loaded.volume, eye)?;
+        }
         if let (None, Some(source)) = (eye, &self.source) {
             self.volume_pass.shade(gpu, source, (field, &loaded.density), &loaded.volume, camera.position)?;
         }

@@ -10,9 +10,9 @@ use super::pass::Kernel;
 use super::transfer::{DeviceLight, DeviceTransfer, TransferPass, Work, dispatch};
 use super::volume::{DeviceVolume, PAGES};
 use crate::medium::field::DensityField;
-use crate::shaded_volume::{BRICK, BRICK_NODES};
+use crate::shaded_volume::BRICK_NODES;
 use crate::transport::transfer::view_directions::{ViewDirections, squares};
-use glam::{DVec3, Vec3};
+use glam::DVec3;
 
 impl TransferPass {
     /// Shades `volume`, which was made of `field`, for an eye in world space; microseconds where the device can tell.

@@ -7,6 +7,7 @@ pub mod transfer;
 
 use crate::medium::field::DensityField;
 use crate::shaded_volume::ShadedVolume;
+use compensated::centres::source::CentreSource;
 use compensated::grid::route::GridSource;
 use glam::DVec3;
 use transfer::source::TransferSource;
@@ -35,6 +36,11 @@ pub trait SourceRadiance: Send + Sync {
 
     /// The planes of the grid route, if it is that: its volume pass has a twin on the device.
     fn as_grid(&self) -> Option<&GridSource> {
+        None
+    }
+
+    /// The radiance at the Gaussians' centres, if it is that: its volume pass has a twin on the device.
+    fn as_centres(&self) -> Option<&CentreSource> {
         None
     }
 
