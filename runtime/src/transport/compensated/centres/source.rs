@@ -58,7 +58,7 @@ impl CentreSource {
     }
 
     /// Unit coordinates of the first `count` nodes along `axis`.
-    pub(crate) fn axis(&self, axis: usize, count: usize) -> impl Iterator<Item = f32> {
+    pub fn axis(&self, axis: usize, count: usize) -> impl Iterator<Item = f32> {
         (0..count).map(move |i| self.unit.coordinate(axis, self.first_node[axis].saturating_add(i as i32)))
     }
 
