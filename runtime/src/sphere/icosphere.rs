@@ -102,8 +102,8 @@ impl Icosphere {
         for _ in 0..self.triangles.len() {
             let [a, b, c] = self.sides[found].map(|side| side.dot(direction));
             let least = a.min(b).min(c);
-            // On a side, by rounding outside of both.
-            if !(least < -5e-16) {
+            // On a side, by rounding outside of both; no number ends the way too.
+            if least >= -5e-16 || least.is_nan() {
                 break;
             }
             let side = if least == a {
