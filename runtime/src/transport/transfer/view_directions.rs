@@ -146,7 +146,9 @@ fn mark(marks: &mut [bool], square: &impl Fn([f32; 3]) -> usize, n: usize, low: 
         mark(marks, square, n, low, end);
         mark(marks, square, n, start, high);
     } else {
-        squares.iter().for_each(|&square| marks[square] = true);
+        // At the eye, or near it, its own square may be none of its corners'.
+        let own = square(low.map(|n| n as f32));
+        squares.iter().chain([&own]).for_each(|&square| marks[square] = true);
     }
 }
 
@@ -186,7 +188,8 @@ mod tests {
 
     #[test]
     fn every_node_of_a_box_has_its_corners_near_and_far_around_the_eye_too() {
-        for corner in [Vec3::new(20.0, 3.0, -4.0), Vec3::new(-2.0, -1.5, -2.2), Vec3::new(3.0, -2.0, 2.9)] {
+        let eyes = [Vec3::new(20.0, 3.0, -4.0), Vec3::new(-2.0, -1.5, -2.2), Vec3::new(3.0, -2.0, 2.9)];
+        for corner in eyes.into_iter().chain([Vec3::new(-1.0, -2.1, -1.0), Vec3::splat(-1.01), Vec3::ZERO]) {
             let edges = [Vec3::new(1.0, 0.1, 0.0), Vec3::Y, Vec3::new(0.0, -0.2, 1.0)];
             let view = ViewDirections::of_boxes(&[(corner, [4; 3])], edges, 20);
             for v in 0..125 {
