@@ -74,7 +74,10 @@ impl ViewDirections {
         let mark = |mut marks: Vec<bool>, (first, sides): &(Vec3, [usize; 3])| {
             let square =
                 |[i, j, k]: [f32; 3]| Between::of(*first + edges[0] * i + edges[1] * j + edges[2] * k, squares).square;
-            mark(&mut marks, &square, squares + 1, [0; 3], *sides);
+            let edge = edges.iter().fold(f32::INFINITY, |least, edge| least.min(edge.length()));
+            let nodes_away = first.abs().max_element() / edge.max(f32::MIN_POSITIVE);
+            let margin = (LEAST_MARGIN + 1e-6 * nodes_away).min(0.05);
+            mark(&mut marks, &square, squares + 1, margin, [0; 3], *sides);
             marks
         };
         let either = |mut a: Vec<bool>, b: Vec<bool>| {
@@ -116,18 +119,29 @@ impl ViewDirections {
         let [f, g] = between.fraction;
         let weights = [(1.0 - f) * (1.0 - g), f * (1.0 - g), (1.0 - f) * g, f * g];
         let corners = between.corners(self.squares);
-        (corners.map(|c| self.places[c]), weights)
+        // A corner that is not in use has next to no weight, by rounding.
+        let last = self.directions.len().saturating_sub(1) as u32;
+        (corners.map(|c| self.places[c].min(last)), weights)
     }
 }
 
-/// What a box of nodes is enlarged by, in nodes: a node that is rounded to another square than here has that one as well.
-const MARGIN: f32 = 0.05;
+/// What a box of nodes is enlarged by at least, in nodes, and more from far away: a node that is rounded to another square
+/// than here has that one as well.
+const LEAST_MARGIN: f32 = 1e-3;
 
 /// Marks the squares of the nodes `low` to `high`; `square` is that of a place in nodes, a face has `n` to a row. A box
-/// whose corners are seen through one face lies between them there, as lines stay lines; others are halved.
-fn mark(marks: &mut [bool], square: &impl Fn([f32; 3]) -> usize, n: usize, low: [usize; 3], high: [usize; 3]) {
+/// whose corners are seen through one face lies between them there, as lines stay lines; others are halved, and those with
+/// more squares between them than nodes along a side.
+fn mark(
+    marks: &mut [bool],
+    square: &impl Fn([f32; 3]) -> usize,
+    n: usize,
+    margin: f32,
+    low: [usize; 3],
+    high: [usize; 3],
+) {
     let corner = |c: usize| {
-        square([0, 1, 2].map(|a| if c >> a & 1 == 0 { low[a] as f32 - MARGIN } else { high[a] as f32 + MARGIN }))
+        square([0, 1, 2].map(|a| if c >> a & 1 == 0 { low[a] as f32 - margin } else { high[a] as f32 + margin }))
     };
     let squares = [0, 1, 2, 3, 4, 5, 6, 7].map(corner);
     let places = squares.map(|square| [square % n, square / n % n, square / n / n]);
@@ -135,7 +149,9 @@ fn mark(marks: &mut [bool], square: &impl Fn([f32; 3]) -> usize, n: usize, low: 
         places.iter().fold(places[0], |so_far, place| [0, 1, 2].map(|a| most(so_far[a], place[a])))
     });
     let longest = [0, 1, 2].into_iter().max_by_key(|&a| high[a] - low[a]).unwrap_or(0);
-    if first[2] == last[2] {
+    // A slanted box, or one near the eye, passes few of the squares between its corners.
+    let between = (last[0] - first[0] + 1) * (last[1] - first[1] + 1);
+    if first[2] == last[2] && between <= high[longest] - low[longest] + 1 {
         for row in first[1]..=last[1] {
             marks[(first[2] * n + row) * n..][first[0]..=last[0]].fill(true);
         }
@@ -143,8 +159,8 @@ fn mark(marks: &mut [bool], square: &impl Fn([f32; 3]) -> usize, n: usize, low: 
         let middle = (low[longest] + high[longest]) / 2;
         let (mut end, mut start) = (high, low);
         (end[longest], start[longest]) = (middle, middle + 1);
-        mark(marks, square, n, low, end);
-        mark(marks, square, n, start, high);
+        mark(marks, square, n, margin, low, end);
+        mark(marks, square, n, margin, start, high);
     } else {
         // At the eye, or near it, its own square may be none of its corners'.
         let own = square(low.map(|n| n as f32));
@@ -195,8 +211,8 @@ mod tests {
             for v in 0..125 {
                 let at =
                     corner + edges[0] * (v % 5) as f32 + edges[1] * (v / 5 % 5) as f32 + edges[2] * (v / 25) as f32;
-                let (places, _) = view.around(Between::of(at, 20));
-                assert!(places.iter().all(|d| (*d as usize) < view.directions().len()), "{at}");
+                let corners = Between::of(at, 20).corners(20);
+                assert!(corners.iter().all(|&c| view.places[c] != UNUSED), "{at}");
             }
         }
     }
