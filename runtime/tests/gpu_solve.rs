@@ -19,20 +19,22 @@ use smoke_runtime::medium::field::DensityField;
 use smoke_runtime::medium::frame::Frame;
 use smoke_runtime::renderer::{RenderSettings, Renderer, Route};
 use smoke_runtime::transport::ScatteringOrder;
+use smoke_runtime::transport::compensated::grid::channels::is_single_channel;
 use smoke_runtime::transport::compensated::grid::columns::SweepGrid;
 use smoke_runtime::transport::compensated::grid::route::{GridSettings, GridTransport, ordinates, weighted};
 use smoke_runtime::transport::compensated::grid::scatter::gather;
 use smoke_runtime::transport::compensated::grid::single::{WeightedBeam, single_scattering};
 use smoke_runtime::transport::medium::{BandedMedium, MediumParameters};
 
-/// Largest difference of a sweep over the largest value. A depth is a sum over some hundred slices, rounded 6e-8 of itself
-/// each; where it is 10, that is 1e-5 of a transmittance, which is then small.
-const SWEEP: f64 = 1e-5;
-/// The same of a gather: a quotient of two sums as long, and a sum over ordinates.
-const GATHER: f64 = 2e-5;
-/// The same of a solution with a relative residual of [`TOLERANCE`] on both sides, whose error is up to 1 / (1 - albedo)
-/// times that.
-const SOLUTION: f64 = 2e-4;
+/// Largest difference of a sweep over the largest value. A depth x is a sum over up to a hundred slices, each rounded by 6e-8
+/// of it: of a transmittance that is x e^-x times 6e-6, at most 2e-6.
+const SWEEP: f64 = 5e-6;
+/// The same of a gather: a quotient of two such sums, and a sum over ordinates.
+const GATHER: f64 = 1e-5;
+/// The same of a solution. Both sides do the same iteration from the same start: they differ by rounding, a few 6e-8 that the
+/// solution takes over 1 / (1 - albedo) = 20 times.
+const SOLUTION: f64 = 1e-5;
+/// Relative residual at which it ends.
 const TOLERANCE: f64 = 1e-5;
 /// Relative RMSE of images: what the device is promised to keep.
 const IMAGE: f64 = 2e-3;
@@ -118,7 +120,7 @@ fn beams_from_everywhere_light_the_nodes_as_they_do_on_the_processor() {
             assert!(lights.len() == 1 || senses == [true; 6]);
             let banded = medium(g).banded(4);
             let bands = if g == 0.0 { 1 } else { 4 };
-            let channels = if lights == white_sky() { 1 } else { 3 };
+            let channels = if is_single_channel(&medium(g), &lights) { 1 } else { 3 };
             let weighted = weighted(&beams, &banded, (bands, channels));
             let worst = single_differs(&gpu, &pass, &field, &weighted, &banded.sigma_t[..channels]);
             eprintln!("single scattering {:?}, g {g}, {} beams, {channels}: {worst:.1e}", field.dims, beams.len());
@@ -185,7 +187,8 @@ fn a_constant_source_of_one_gathers_one_minus_transmittance_on_the_device_too() 
     told(6);
 }
 
-/// Largest difference of each layer, and products of both sides.
+/// Largest difference of each layer, and products of both sides; infinite where these differ by more than one, because both
+/// do the same iteration.
 fn solutions_differ(
     gpu: &Gpu,
     pass: &GridPass,
@@ -206,7 +209,9 @@ fn solutions_differ(
         assert_eq!(grid.dims, dims);
         worst(&grid, expected, &found)
     });
-    (layers.collect(), [expected.iterations, found.iterations])
+    let products = [expected.iterations, found.iterations];
+    let alike = if products[0].abs_diff(products[1]) <= 1 { 0.0 } else { f64::INFINITY };
+    (layers.map(|worst| worst + alike).collect(), products)
 }
 
 #[test]
@@ -223,9 +228,8 @@ fn both_sides_find_the_same_source_radiance_whatever_the_phase_and_colour() {
             (tiny(), white_sky(), coloured(-0.4)),
         ] {
             let (worst, products) = solutions_differ(&gpu, &pass, &field, &medium, &lights);
-            eprintln!("solution {:?}, {medium:?}: {worst:.1e?}, products {products:?}", field.dims);
+            eprintln!("solution {:?}, {medium:?}: {worst:?}, products {products:?}", field.dims);
             assert!(worst[0] <= SWEEP && worst[1] <= SOLUTION, "{worst:?}");
-            assert!(products[0].abs_diff(products[1]) <= 1, "{products:?}");
             cases += 1;
         }
     }

@@ -53,11 +53,7 @@ impl GmresPass {
     /// From another text of the same bindings: how a planted difference is shown to be found.
     pub fn from_source(gpu: &Gpu, source: &str) -> Result<Self, GpuError> {
         let kernel = |entry| Kernel::new(gpu, "GMRES", source, entry);
-        Ok(Self {
-            dot_blocks: kernel("dot_blocks")?,
-            add_blocks: kernel("add_blocks")?,
-            combine: kernel("combine")?,
-        })
+        Ok(Self { dot_blocks: kernel("dot_blocks")?, add_blocks: kernel("add_blocks")?, combine: kernel("combine")? })
     }
 
     /// Improves the solution `x` of `x - G x = b`, where `gather` adds `-G`, until the relative residual is below
@@ -88,16 +84,10 @@ impl GmresPass {
             dispatch(gpu, STAGE, &self.combine(gpu, &sums, x, 0.0, Factor::Plain(1.0), b))?;
             return Ok(Solved { iterations: 0, residual: 0.0 });
         }
-        // (1 - G) v, and what is added to it.
-        let product = |v| {
-            let mut steps = self.combine(gpu, &sums, &work, 0.0, Factor::Plain(1.0), v);
-            steps.extend(gather.add(gpu, v, &work));
-            steps
-        };
         let mut iterations = 0;
         let mut basis = vec![vector()?];
         loop {
-            let mut steps = product(x);
+            let mut steps = self.product(gpu, &sums, gather, x, &work);
             steps.extend(self.combine(gpu, &sums, &work, -1.0, Factor::Plain(1.0), b));
             steps.extend(self.dot(gpu, &sums, &work, &work, 0));
             steps.extend(self.combine(gpu, &sums, &basis[0], 0.0, Factor::InverseRoot(0), &work));
@@ -114,7 +104,7 @@ impl GmresPass {
                 if basis.len() < k + 2 {
                     basis.push(vector()?);
                 }
-                let mut steps = product(&basis[k]);
+                let mut steps = self.product(gpu, &sums, gather, &basis[k], &work);
                 for (slot, v) in basis[..=k].iter().enumerate() {
                     steps.extend(self.dot(gpu, &sums, v, &work, slot));
                     steps.extend(self.combine(gpu, &sums, &work, 1.0, Factor::Sum(-1.0, slot), v));
@@ -142,6 +132,20 @@ impl GmresPass {
                 return Ok(Solved { iterations, residual: small.rest() / scale });
             }
         }
+    }
+
+    /// `out <- v - G v`.
+    fn product<'a>(
+        &'a self,
+        gpu: &Gpu,
+        sums: &'a Sums,
+        gather: &'a Gather,
+        v: &'a Planes,
+        out: &'a Planes,
+    ) -> Vec<Work<'a>> {
+        let mut work = self.combine(gpu, sums, out, 0.0, Factor::Plain(1.0), v);
+        work.extend(gather.add(gpu, v, out));
+        work
     }
 
     /// The sum of products of two vectors, into a slot.
