@@ -27,7 +27,9 @@ fn exp_neg_and_rest(x: f32) -> vec2<f32> {
 
 // Share of a cell's emission that its near end has.
 fn near_share(x: f32, rest: f32) -> f32 {
-    let thin = 0.5 + x * (1.0 / 12.0) - x * x * x * (1.0 / 720.0);
+    // The series is for x below 0.5; further on it must not overflow.
+    let t = min(x, 0.5);
+    let thin = 0.5 + t * (1.0 / 12.0) - t * t * t * (1.0 / 720.0);
     let thick = 1.0 / max(rest, 0.3) - 1.0 / max(x, 0.3);
     return select(thick, thin, x < 0.5);
 }
