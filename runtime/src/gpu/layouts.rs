@@ -150,6 +150,26 @@ layout! {
 }
 
 layout! {
+    /// The volume pass of the route through centres: members as `centres/volume_pass.wgsl` describes them.
+    CentreVolume {
+        /// The eye, unit space.
+        eye: [f32; 4],
+        /// Nodes of the field.
+        dims: [u32; 4],
+        /// Bricks along each axis.
+        bricks: [u32; 4],
+        /// First brick of the page.
+        first_brick: u32,
+        /// Bricks of the page.
+        page_bricks: u32,
+        /// Gaussians.
+        count: u32,
+        /// Bands of what they send.
+        bands: u32,
+    }
+}
+
+layout! {
     /// A product with a light: members as `product.wgsl` describes them.
     Product {
         /// Colour channels of the rows, 1 or 0.
@@ -443,12 +463,13 @@ layout! {
 mod tests {
     use super::*;
     use crate::gpu::pass::PRELUDE;
-    use crate::gpu::{decode, gmres, march, scatter, single, transfer, volume_pass};
+    use crate::gpu::{centres, decode, gmres, march, scatter, single, transfer, volume_pass};
     use naga::TypeInner;
 
-    const SHADERS: [(&str, &str); 11] = [
+    const SHADERS: [(&str, &str); 12] = [
         ("march.wgsl", march::SHADER),
         ("route.wgsl", volume_pass::SHADER),
+        ("centres/volume_pass.wgsl", centres::SHADER),
         ("product.wgsl", transfer::PRODUCT),
         ("view_directions.wgsl", transfer::VIEW_DIRECTIONS),
         ("cells.wgsl", transfer::CELLS),
@@ -461,11 +482,12 @@ mod tests {
     ];
     type Members = &'static [(&'static str, usize, usize)];
     /// Every structure of every shader.
-    const LAYOUTS: [(&str, usize, Members); 15] = [
+    const LAYOUTS: [(&str, usize, Members); 16] = [
         ("March", size_of::<March>(), March::MEMBERS),
         ("Pixel", size_of::<Pixel>(), Pixel::MEMBERS),
         ("Environment", size_of::<Environment>(), Environment::MEMBERS),
         ("VolumePass", size_of::<VolumePass>(), VolumePass::MEMBERS),
+        ("CentreVolume", size_of::<CentreVolume>(), CentreVolume::MEMBERS),
         ("Product", size_of::<Product>(), Product::MEMBERS),
         ("ViewDirections", size_of::<ViewDirections>(), ViewDirections::MEMBERS),
         ("Cells", size_of::<Cells>(), Cells::MEMBERS),

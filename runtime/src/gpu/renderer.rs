@@ -1,9 +1,10 @@
 //! The calls of [`Renderer`], with the grid route, transfer and the view pass on a device.
 //!
-//! Decoding is the processor's, and so is the route through centres: their results are copied. Kept until an edit makes them
-//! void: grids, planes, clusters and their light, bricks and backdrop on the device. So other light costs sweeps and solve,
-//! another view the volume pass and the march.
+//! Decoding is the processor's, and so are the solution at centres and the projection of light onto transfer: their results
+//! are copied. Kept until an edit makes them void: grids, planes, clusters and their light, bricks and backdrop on the
+//! device. So other light costs sweeps and solve, another view the volume pass and the march.
 
+use super::centres::{CentrePass, DeviceCentres};
 use super::device::{Gpu, GpuError};
 use super::grid_solve::{DeviceGrids, GridPass};
 use super::march::{DeviceSky, MarchPass};
@@ -18,7 +19,6 @@ use crate::march::{MarchMedium, MarchSettings};
 use crate::medium::field::DensityField;
 use crate::medium::frame::Frame;
 use crate::renderer::{Lit, RenderError, RenderSettings, Renderer, Seconds, Unlit};
-use crate::shaded_volume::ShadedVolume;
 use crate::transport::medium::MediumParameters;
 use glam::DVec3;
 use std::sync::Arc;
@@ -61,6 +61,8 @@ pub struct GpuRenderer {
     grid_pass: GridPass,
     grids: DeviceGrids,
     source: Option<DeviceSource>,
+    centre_pass: CentrePass,
+    centres: Option<DeviceCentres>,
     transfer_pass: TransferPass,
     transfer: Option<DeviceTransfer>,
     light: Option<DeviceLight>,
@@ -86,22 +88,24 @@ impl GpuRenderer {
         self_test::check(&gpu, &march)?;
         let transfer_pass = TransferPass::new(&gpu)?;
         let (grid_pass, grids) = (GridPass::new(&gpu)?, DeviceGrids::default());
-        let (sky, source, transfer, light, loaded, eye) = (None, None, None, None, None, None);
+        let centre_pass = CentrePass::new(&gpu)?;
         Ok(Self {
             gpu,
             solver,
             march,
             march_settings: settings.march,
             volume_pass,
-            sky,
+            sky: None,
             grid_pass,
             grids,
-            source,
+            source: None,
+            centre_pass,
+            centres: None,
             transfer_pass,
-            transfer,
-            light,
-            loaded,
-            eye,
+            transfer: None,
+            light: None,
+            loaded: None,
+            eye: None,
         })
     }
 
@@ -112,21 +116,27 @@ impl GpuRenderer {
 
     /// Another frame.
     pub fn set_frame(&mut self, frame: Frame) -> Result<(), RenderError> {
-        (self.source, self.transfer, self.light, self.loaded, self.eye) = (None, None, None, None, None);
+        (self.source, self.centres, self.eye) = (None, None, None);
+        (self.transfer, self.light, self.loaded) = (None, None, None);
         self.grids = DeviceGrids::default();
         self.solver.set_frame(frame)
     }
 
     /// Other lights.
     pub fn set_lights(&mut self, lights: Vec<Light>) -> Result<(), RenderError> {
-        (self.sky, self.source, self.light, self.eye) = (None, None, None, None);
+        self.unlit();
         self.solver.set_lights(lights)
     }
 
     /// Another medium.
     pub fn set_medium(&mut self, medium: MediumParameters) -> Result<(), RenderError> {
-        (self.sky, self.source, self.light, self.eye) = (None, None, None, None);
+        self.unlit();
         self.solver.set_medium(medium)
+    }
+
+    /// Drops what depends on lights and medium.
+    fn unlit(&mut self) {
+        (self.sky, self.source, self.centres, self.light, self.eye) = (None, None, None, None, None);
     }
 
     /// The image from `camera`, and the seconds it took, copies included; empty pixels before any frame.
@@ -180,10 +190,13 @@ impl GpuRenderer {
     /// The same for the other routes; none before any frame.
     fn shade(&mut self, camera: &Camera, seconds: &mut Seconds) -> Result<Option<MarchMedium>, GpuRenderError> {
         let start = Instant::now();
-        let Some(Lit { field, volume: shaded, source, medium, sky, .. }) = self.solver.lit()? else {
+        let Some(Lit { field, source, medium, sky, .. }) = self.solver.lit()? else {
             return Ok(None);
         };
         let gpu = &*self.gpu;
+        if let (None, Some(centres)) = (&self.centres, source.as_centres()) {
+            self.centres = Some(DeviceCentres::new(gpu, centres, field)?);
+        }
         let transfer = source.as_transfer();
         if let (None, Some(source)) = (&self.transfer, transfer) {
             self.transfer = Some(DeviceTransfer::new(gpu, source, field)?);
@@ -194,19 +207,16 @@ impl GpuRenderer {
         seconds.source_radiance = start.elapsed().as_secs_f64();
         let start = Instant::now();
         let eye = self.eye.take().filter(|&eye| eye == camera.position || !source.depends_on_view());
-        let loaded = match (self.loaded.take(), transfer) {
-            // A frame's bricks are the same under any light; others' volumes come whole from the processor.
-            (Some(loaded), Some(_)) => loaded,
-            (Some(loaded), None) if eye.is_some() => loaded,
-            (_, Some(_)) => Loaded::of_field(gpu, field)?,
-            (_, None) => {
-                let shaded = shaded.get_or_insert_with(|| ShadedVolume::of(field));
-                source.shade(field, camera.position, shaded);
-                let density = gpu.upload::<f32>("density of the frame", &[])?;
-                Loaded { volume: DeviceVolume::of_shaded(gpu, shaded)?, density }
-            }
+        // A frame's bricks are the same under any light.
+        let loaded = match self.loaded.take() {
+            Some(loaded) => loaded,
+            None => Loaded::of_field(gpu, field)?,
         };
         let loaded = self.loaded.insert(loaded);
+        if let (None, Some(device), Some(centres)) = (eye, &self.centres, source.as_centres()) {
+            let eye = centres.unit_from_world(camera.position);
+            self.centre_pass.shade(gpu, device, (field, &loaded.density), &loaded.volume, eye)?;
+        }
         if let (None, Some(light), Some(frame)) = (eye, &self.light, &self.transfer) {
             let density = (field, &loaded.density);
             self.transfer_pass.shade(gpu, frame, light, density, &loaded.volume, camera.position)?;
