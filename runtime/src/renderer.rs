@@ -23,6 +23,7 @@ use crate::transport::medium::{BandedMedium, MediumError, MediumParameters};
 use crate::transport::transfer::source::{TransferError, TransferSettings, TransferTransport};
 use crate::transport::{ScatteringOrder, SourceRadiance};
 use glam::DVec3;
+use std::sync::Arc;
 use std::time::Instant;
 
 /// Where the source radiance is solved.
@@ -162,7 +163,7 @@ pub struct Renderer {
     lights: Vec<Light>,
     /// The lights as beams, for the grid route.
     beams: Option<Vec<Beam>>,
-    sky: Option<Sky>,
+    sky: Option<Arc<Sky>>,
     loaded: Option<Loaded>,
     source: Option<(Box<dyn SourceRadiance>, MarchMedium)>,
     /// The eye that the frame's volume is shaded for.
@@ -244,7 +245,7 @@ impl Renderer {
         }
         seconds.volume_pass = start.elapsed().as_secs_f64();
         let start = Instant::now();
-        let film = march(volume, camera, lit.medium, lit.sky, lit.march);
+        let film = march(volume, camera, lit.medium, &**lit.sky, lit.march);
         seconds.view_pass = start.elapsed().as_secs_f64();
         Ok((film, seconds))
     }
@@ -283,7 +284,7 @@ impl Renderer {
 pub(crate) struct Unlit<'a> {
     pub(crate) problem: GridProblem<'a>,
     pub(crate) medium: MarchMedium,
-    pub(crate) sky: &'a Sky,
+    pub(crate) sky: &'a Arc<Sky>,
 }
 
 /// A frame under its lights: what the passes after the solution need.
@@ -294,7 +295,7 @@ pub(crate) struct Lit<'a> {
     pub(crate) shaded: &'a mut Option<DVec3>,
     pub(crate) source: &'a dyn SourceRadiance,
     pub(crate) medium: &'a MarchMedium,
-    pub(crate) sky: &'a Sky,
+    pub(crate) sky: &'a Arc<Sky>,
     pub(crate) march: &'a MarchSettings,
 }
 
@@ -308,9 +309,9 @@ fn grid_medium(medium: &MediumParameters, settings: &RenderSettings) -> (BandedM
 }
 
 /// The sky behind the medium, made if it is not there; `peak` is its forward peak, if the march takes one out.
-fn sky<'a>(sky: &'a mut Option<Sky>, lights: &[Light], medium: &MarchMedium, peak: (f32, usize)) -> &'a Sky {
+fn sky<'a>(sky: &'a mut Option<Arc<Sky>>, lights: &[Light], medium: &MarchMedium, peak: (f32, usize)) -> &'a Arc<Sky> {
     let peak = (medium.peak_ratio != [1.0; 3]).then_some(peak);
-    sky.get_or_insert_with(|| Sky::new(lights, peak))
+    sky.get_or_insert_with(|| Arc::new(Sky::new(lights, peak)))
 }
 
 fn solve(

@@ -64,8 +64,8 @@ layout! {
         environments: u32,
         /// 1 where a forward peak counts as not scattered.
         has_peak: u32,
-        /// Tangent of a pixel.
-        pixel: f32,
+        /// Tangents of a pixel, across and down.
+        pixel: [f32; 2],
         /// World length between samples.
         ds: f32,
         /// Distance of the plane along the axis, world length.
@@ -78,8 +78,14 @@ layout! {
         least: i32,
         /// Transmittance at which a ray ends.
         cutoff: f32,
+        /// 1 where the film lists its pixels.
+        listed: u32,
         /// Nothing.
-        pad: f32,
+        pad_0: f32,
+        /// Nothing.
+        pad_1: f32,
+        /// Nothing.
+        pad_2: f32,
     }
 }
 
@@ -540,7 +546,7 @@ mod tests {
     fn a_member_that_is_moved_renamed_or_missing_is_found() {
         for (from, to) in [
             ("    least: i32,\n    cutoff: f32,", "    cutoff: f32,\n    least: i32,"),
-            ("    pixel: f32,", "    texel: f32,"),
+            ("    pixel: vec2<f32>,", "    texel: vec2<f32>,"),
             ("    peak_ratio: vec4<f32>,", ""),
             ("    up_is_y: u32,", "    up_is_y: vec2<u32>,"),
         ] {

@@ -80,10 +80,6 @@ impl GpuRenderer {
         lights: Vec<Light>,
     ) -> Result<Self, GpuRenderError> {
         let solver = Renderer::new(settings, medium, lights)?;
-        if settings.march.half_resolution {
-            let name = "half resolution";
-            return Err(GpuError::Setting { name, found: "true", expected: "false" }.into());
-        }
         let (march, volume_pass) = (MarchPass::new(&gpu)?, VolumePass::new(&gpu)?);
         self_test::check(&gpu, &march)?;
         let transfer_pass = TransferPass::new(&gpu)?;
