@@ -24,11 +24,13 @@ pub trait Marcher: Send {
     fn set_medium(&mut self, medium: MediumParameters) -> Result<(), String>;
     /// The image from `camera`.
     fn render(&mut self, camera: &Camera) -> Result<(Film, Seconds), String>;
+    /// Microseconds of the graphics device's stages since the last call, where there is one and it can tell.
+    fn device_microseconds(&self) -> Vec<(&'static str, f64)>;
 }
 
 /// The same calls of either renderer.
 macro_rules! marches {
-    ($renderer:ty) => {
+    ($renderer:ty, $times:expr) => {
         impl Marcher for $renderer {
             fn set_frame(&mut self, frame: Frame) -> Result<(), String> {
                 Self::set_frame(self, frame).map_err(|e| e.to_string())
@@ -45,13 +47,17 @@ macro_rules! marches {
             fn render(&mut self, camera: &Camera) -> Result<(Film, Seconds), String> {
                 Self::render(self, camera).map_err(|e| e.to_string())
             }
+
+            fn device_microseconds(&self) -> Vec<(&'static str, f64)> {
+                $times(self)
+            }
         }
     };
 }
 
-marches!(Renderer);
+marches!(Renderer, |_| Vec::new());
 #[cfg(feature = "gpu")]
-marches!(GpuRenderer);
+marches!(GpuRenderer, |renderer: &GpuRenderer| renderer.gpu().take_times());
 
 /// What marches on `device`, under the lights and medium of `stage`.
 pub fn marcher(device: &Device, settings: RenderSettings, stage: &Stage) -> Result<Box<dyn Marcher>, String> {

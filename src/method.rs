@@ -44,6 +44,8 @@ pub struct Image {
     pub standard_error: Option<Vec<[f32; 3]>>,
     /// Wall seconds of each stage, by name.
     pub seconds: Vec<(&'static str, f64)>,
+    /// Microseconds of the stages on a graphics device, where there is one and it can tell.
+    pub device_microseconds: Vec<(&'static str, f64)>,
     /// Further figures for `--json`.
     pub figures: Value,
 }
@@ -136,7 +138,8 @@ impl Maker<'_> {
                 let source_radiance = source_radiance + prepared;
                 let seconds =
                     vec![("source_radiance", source_radiance), ("volume_pass", volume_pass), ("view_pass", view_pass)];
-                Ok(Image { film, standard_error: None, seconds, figures: json!({}) })
+                let device_microseconds = marcher.device_microseconds();
+                Ok(Image { film, standard_error: None, seconds, device_microseconds, figures: json!({}) })
             }
             Self::Reference(settings, stage) => {
                 let mut on_pass = |passes, error| done(reference::part_done(settings, passes, error));
@@ -145,7 +148,8 @@ impl Maker<'_> {
                 let traced = traced.map_err(|e| e.to_string())?;
                 let figures = reference::figures(&traced);
                 let seconds = vec![("trace", start.elapsed().as_secs_f64())];
-                Ok(Image { film: traced.film, standard_error: Some(traced.standard_error), seconds, figures })
+                let (film, standard_error) = (traced.film, Some(traced.standard_error));
+                Ok(Image { film, standard_error, seconds, device_microseconds: Vec::new(), figures })
             }
         }
     }

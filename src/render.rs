@@ -19,7 +19,7 @@ use smoke_runtime::medium::frame::Frame;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-/// Wall seconds of stages, by name; those of different frames overlap.
+/// What stages took, by name; wall seconds of different frames overlap.
 type Stages = Vec<(&'static str, f64)>;
 
 /// A frame, ready to be lit.
@@ -42,6 +42,7 @@ struct Report {
     frame: i32,
     path: PathBuf,
     seconds: Stages,
+    device_microseconds: Stages,
     figures: Value,
     clamped: usize,
 }
@@ -193,7 +194,8 @@ impl Job<'_> {
         let start = Instant::now();
         let clamped = self.write(number, &image, &path)?;
         seconds.push(("write", start.elapsed().as_secs_f64()));
-        Ok(Report { frame: number, path, seconds, figures: image.figures, clamped })
+        let Image { device_microseconds, figures, .. } = image;
+        Ok(Report { frame: number, path, seconds, device_microseconds, figures, clamped })
     }
 
     /// The image of `frame`, which is the one at `position` of the pack.
@@ -259,14 +261,19 @@ pub fn changes(args: &RenderArgs) -> SceneChanges {
 
 impl Report {
     fn json(&self, megapixels: f64) -> Value {
-        let seconds: serde_json::Map<String, Value> =
-            self.seconds.iter().map(|(name, seconds)| ((*name).to_owned(), json!(seconds))).collect();
+        let by_name = |stages: &Stages| -> serde_json::Map<String, Value> {
+            stages.iter().map(|(name, took)| ((*name).to_owned(), json!(took))).collect()
+        };
+        let seconds = by_name(&self.seconds);
         let mut report = json!({
             "frame": self.frame,
             "image": self.path.display().to_string(),
             "seconds": seconds,
             "samples_above_half": self.clamped,
         });
+        if !self.device_microseconds.is_empty() {
+            report["device_microseconds"] = by_name(&self.device_microseconds).into();
+        }
         if let Some((_, view_pass)) = self.seconds.iter().find(|(name, _)| *name == "view_pass") {
             report["view_pass_megapixels_per_second"] = json!(megapixels / view_pass);
         }

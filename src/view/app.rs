@@ -44,7 +44,7 @@ pub struct Shown {
     stops: f64,
     /// Passes in it, and how many it will have; no passes while moving.
     pub passes: [u32; 2],
-    /// Seconds of its stages.
+    /// What its stages took.
     pub stages: painter::Stages,
 }
 

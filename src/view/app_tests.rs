@@ -210,8 +210,9 @@ fn key_s_saves_and_an_edit_of_the_light_is_seen_in_the_next_picture() {
     window.until("another picture", is_sharp);
     assert!(window.app.shown.as_ref().unwrap().film.pixels != before.pixels);
     window.app.state.method = MethodChoice::Reference;
-    window
-        .until("a traced picture", |app| is_sharp(app) && app.shown.as_ref().is_some_and(|s| s.stages[0].0 == "trace"));
+    window.until("a traced picture", |app| {
+        is_sharp(app) && app.shown.as_ref().is_some_and(|s| s.stages.wall[0].0 == "trace")
+    });
     window.app.state.method = MethodChoice::Transfer;
     window.until("why not", |app| app.message.as_ref().is_some_and(|m| m.bad));
 }

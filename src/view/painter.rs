@@ -16,15 +16,21 @@ use smoke_runtime::transport::reference::{ReferenceSettings, trace};
 use std::sync::Arc;
 use std::time::Instant;
 
-/// Seconds of the stages of a picture, by name, in their order.
-pub type Stages = Vec<(&'static str, f64)>;
+/// What the stages of a picture took, by name, in their order.
+#[derive(Clone, Default)]
+pub struct Stages {
+    /// Wall seconds.
+    pub wall: Vec<(&'static str, f64)>,
+    /// Microseconds on the graphics device, where there is one and it can tell.
+    pub device: Vec<(&'static str, f64)>,
+}
 
 /// Passes that the path tracer makes at once, from the first pass of a picture on: the least that give an image, then
 /// more, because each call builds its tables anew.
 const TRACED: [u32; 4] = [2, 2, 4, 8];
 
 /// Stages as the panel names them.
-fn stages(Seconds { source_radiance, volume_pass, view_pass }: Seconds) -> Stages {
+fn wall(Seconds { source_radiance, volume_pass, view_pass }: Seconds) -> Vec<(&'static str, f64)> {
     vec![("source radiance", source_radiance), ("volume pass", volume_pass), ("view pass", view_pass)]
 }
 
@@ -45,7 +51,7 @@ pub struct Pass {
     pub film: Film,
     /// How many times it counts in the mean of all passes.
     pub weight: u32,
-    /// Wall seconds of its stages.
+    /// What its stages took.
     pub stages: Stages,
 }
 
@@ -86,8 +92,9 @@ impl Painter {
                 // A renderer that refused something holds a mixture: the next picture begins anew.
                 let mut told = self.tell(*settings, stage, frame)?;
                 let (film, seconds) = told.marcher.render(camera)?;
+                let stages = Stages { wall: wall(seconds), device: told.marcher.device_microseconds() };
                 self.told = Some(told);
-                Ok(Pass { film, weight: 1, stages: stages(seconds) })
+                Ok(Pass { film, weight: 1, stages })
             }
             Method::Reference(settings) => {
                 let start = Instant::now();
@@ -96,7 +103,8 @@ impl Painter {
                 let settings = ReferenceSettings { target_error: 0.0, max_passes: passes, seed, ..*settings };
                 let traced = trace(&frame.field, &stage.medium, &stage.lights, camera, &settings, &mut |_, _| {});
                 let film = traced.map_err(|e| e.to_string())?.film;
-                Ok(Pass { film, weight: passes, stages: vec![("trace", start.elapsed().as_secs_f64())] })
+                let stages = Stages { wall: vec![("trace", start.elapsed().as_secs_f64())], device: Vec::new() };
+                Ok(Pass { film, weight: passes, stages })
             }
         }
     }

@@ -245,8 +245,12 @@ fn time(app: &mut App, ui: &mut Ui) {
         _ => format!("pass {passes} of {of}"),
     };
     row(ui, "Picture", |ui| text(ui, progress));
-    for (name, seconds) in &shown.stages {
+    for (name, seconds) in &shown.stages.wall {
         row(ui, RichText::new(*name).small(), |ui| text(ui, format!("{:.1} ms", seconds * 1e3)));
+    }
+    for (name, microseconds) in &shown.stages.device {
+        let name = RichText::new(format!("on the device: {name}")).small();
+        row(ui, name, |ui| text(ui, format!("{microseconds:.0} us")));
     }
     row(ui, "Pictures", |ui| text(ui, format!("{} a second", app.rate())));
     let (decoded, kept) = app.playback.fill();

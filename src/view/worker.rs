@@ -53,7 +53,7 @@ pub struct Picture {
     pub passes: u32,
     /// Passes that it will have.
     pub of: u32,
-    /// Wall seconds of the last pass.
+    /// What the last pass took.
     pub stages: Stages,
 }
 
@@ -228,7 +228,7 @@ struct Pace {
 impl Pace {
     /// Notes the last stage, the only one that depends on the pixels.
     fn took(&mut self, pixels: usize, stages: &Stages) {
-        let last = stages.last().map(|s| s.1 / pixels.max(1) as f64);
+        let last = stages.wall.last().map(|s| s.1 / pixels.max(1) as f64);
         self.seconds_per_pixel = last.filter(|s| s.is_finite()).or(self.seconds_per_pixel);
     }
 
@@ -340,7 +340,7 @@ mod tests {
         let mut renderer = Renderer::new(RenderSettings::default(), stage.medium, stage.lights.clone()).unwrap();
         renderer.set_frame((*request.frame).clone()).unwrap();
         assert_eq!((*first.film).clone(), renderer.render(&stage.camera).unwrap().0);
-        assert_eq!((first.passes, first.of, first.stages.len()), (1, PASSES[0], 3));
+        assert_eq!((first.passes, first.of, first.stages.wall.len()), (1, PASSES[0], 3));
         let mut last = first;
         while last.passes < PASSES[0] {
             last = wait(&worker).map_err(|e| e.1).unwrap();
@@ -379,7 +379,8 @@ mod tests {
         let mut pace = Pace::default();
         assert_eq!(pace.divisor(1_000_000), COARSEST / 2);
         for (seconds, divisor) in [(0.029, 1), (0.031, 2), (0.12, 2), (0.26, 3), (1e9, COARSEST)] {
-            pace.took(1_000_000, &vec![("solve", 100.0), ("march", seconds)]);
+            let wall = vec![("solve", 100.0), ("march", seconds)];
+            pace.took(1_000_000, &Stages { wall, device: Vec::new() });
             assert_eq!(pace.divisor(1_000_000), divisor, "{seconds}");
         }
         let worker = Worker::start(Device::Cpu, Skies::default(), || {});

@@ -73,16 +73,6 @@ pub enum GpuError {
         /// The largest.
         limit: u64,
     },
-    /// A setting that has no pass on the device yet.
-    #[error("{name}: found {found}, expected {expected} on a device; use --device cpu")]
-    Setting {
-        /// Which one.
-        name: &'static str,
-        /// Its value.
-        found: &'static str,
-        /// What can be.
-        expected: &'static str,
-    },
     /// No memory is left.
     #[error("{stage}: the device is out of memory; close other programs that use it, or use --device cpu")]
     OutOfMemory {
@@ -123,7 +113,12 @@ pub struct Gpu {
     pub(crate) queue: wgpu::Queue,
     summary: AdapterSummary,
     lost: Arc<Mutex<Option<String>>>,
+    /// Microseconds of the stages that were dispatched, in their order.
+    pub(super) times: Mutex<StageTimes>,
 }
+
+/// Microseconds on the device by stage, in the order of their first dispatch.
+pub type StageTimes = Vec<(&'static str, f64)>;
 
 /// All adapters, in the order in which [`Choice::Best`] prefers them.
 pub fn adapters() -> Vec<AdapterSummary> {
@@ -218,7 +213,7 @@ impl Gpu {
             }
         });
         let summary = described(&device.adapter_info(), &device.limits(), device.features());
-        Self { device, queue, summary, lost }
+        Self { device, queue, summary, lost, times: Mutex::default() }
     }
 
     /// The adapter, with the limits that hold for this device.

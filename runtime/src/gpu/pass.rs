@@ -3,9 +3,9 @@
 //! A dispatch has at most 65,535 groups along an axis: more are folded into two axes, and the shader unfolds them
 //! (`pass.wgsl`, which goes before the text of every kernel).
 
-use super::device::{Gpu, GpuError};
+use super::device::{Gpu, GpuError, StageTimes};
 use bytemuck::Pod;
-use std::sync::mpsc;
+use std::sync::{PoisonError, mpsc};
 
 /// Invocations of a group, as in `pass.wgsl`.
 pub const GROUP: u32 = 64;
@@ -150,8 +150,21 @@ impl Gpu {
             let Some(times) = times else { return Ok(None) };
             let ticks: Vec<u64> = self.copy_back(stage, &times, 16)?;
             let period = f64::from(self.queue.get_timestamp_period());
-            Ok(ticks[1].checked_sub(ticks[0]).map(|ticks| ticks as f64 * period * 1e-3))
+            let took = ticks[1].checked_sub(ticks[0]).map(|ticks| ticks as f64 * period * 1e-3);
+            if let Some(took) = took {
+                let mut times = self.times.lock().unwrap_or_else(PoisonError::into_inner);
+                match times.iter_mut().find(|(name, _)| *name == stage) {
+                    Some((_, sum)) => *sum += took,
+                    None => times.push((stage, took)),
+                }
+            }
+            Ok(took)
         })
+    }
+
+    /// What was dispatched since the last call took; nothing where the device cannot tell.
+    pub fn take_times(&self) -> StageTimes {
+        std::mem::take(&mut *self.times.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
     /// The first `count` values of a storage buffer.
