@@ -5,7 +5,7 @@ use crate::staging::Stage;
 use smoke_runtime::camera::Camera;
 use smoke_runtime::film::Film;
 #[cfg(feature = "gpu")]
-use smoke_runtime::gpu::renderer::GpuRenderer;
+use smoke_runtime::gpu::renderer::{GpuRenderer, SolveOn};
 use smoke_runtime::light::Light;
 use smoke_runtime::medium::frame::Frame;
 use smoke_runtime::renderer::{RenderSettings, Renderer, Seconds};
@@ -66,7 +66,8 @@ pub fn marcher(device: &Device, settings: RenderSettings, stage: &Stage) -> Resu
         Device::Cpu => Box::new(Renderer::new(settings, medium, lights).map_err(|e| e.to_string())?),
         #[cfg(feature = "gpu")]
         Device::Gpu(gpu) => {
-            Box::new(GpuRenderer::new(gpu.clone(), settings, medium, lights).map_err(|e| e.to_string())?)
+            let solve_on = SolveOn::best(gpu);
+            Box::new(GpuRenderer::new(gpu.clone(), settings, medium, lights, solve_on).map_err(|e| e.to_string())?)
         }
     })
 }

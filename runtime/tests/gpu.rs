@@ -10,7 +10,7 @@ use smoke_runtime::backdrop::Sky;
 use smoke_runtime::camera::Camera;
 use smoke_runtime::gpu::device::{Choice, ForcedLimits, Gpu, GpuError};
 use smoke_runtime::gpu::march::{self, DeviceSky, MarchPass};
-use smoke_runtime::gpu::renderer::{GpuRenderError, GpuRenderer};
+use smoke_runtime::gpu::renderer::{GpuRenderError, GpuRenderer, SolveOn};
 use smoke_runtime::gpu::volume::DeviceVolume;
 use smoke_runtime::gpu::volume_pass::{self, DeviceSource, VolumePass};
 use smoke_runtime::light::{Environment, Light, beams};
@@ -184,7 +184,7 @@ fn images_agree_after_every_kind_of_edit_and_with_pages_of_few_bricks() {
         let (field, other) = (plume(6), tiny());
         let camera = cameras(&field);
         let mut cpu = Renderer::new(settings, medium(0.4), sky()).unwrap();
-        let mut device = GpuRenderer::new(gpu, settings, medium(0.4), sky()).unwrap();
+        let mut device = GpuRenderer::new(gpu, settings, medium(0.4), sky(), SolveOn::Device).unwrap();
         let mut same = |cpu: &mut Renderer, device: &mut GpuRenderer, camera: &Camera, what: &str| {
             let (expected, a) = cpu.render(camera).unwrap();
             let (found, b) = device.render(camera).unwrap();
@@ -216,7 +216,8 @@ fn images_agree_after_every_kind_of_edit_and_with_pages_of_few_bricks() {
 fn what_a_device_cannot_hold_or_do_is_refused_by_name() {
     let Some(gpu) = device(ForcedLimits { storage_binding: Some(64 << 10) }) else { return };
     assert_eq!(gpu.summary().storage_binding, 64 << 10);
-    let mut renderer = GpuRenderer::new(Arc::clone(&gpu), RenderSettings::default(), medium(0.0), sky()).unwrap();
+    let mut renderer =
+        GpuRenderer::new(Arc::clone(&gpu), RenderSettings::default(), medium(0.0), sky(), SolveOn::Device).unwrap();
     let field = plume(1);
     let camera = cameras(&field)[0];
     renderer.set_frame(frame(field)).unwrap();
@@ -242,7 +243,7 @@ fn half_resolution_is_the_same_on_both_sides_for_odd_sizes_and_with_a_peak() {
         let source = source(&field, 0.5);
         let pass = MarchPass::new(&gpu).unwrap();
         for (width, height) in [(64, 48), (63, 47), (61, 1)] {
-            let camera = Camera { width, height, ..cameras(&field)[0].clone() };
+            let camera = Camera { width, height, ..cameras(&field)[0] };
             let shaded = shaded(&source, &field, camera.position);
             let volume = DeviceVolume::of_shaded(&gpu, &shaded).unwrap();
             for (medium, samples) in
@@ -270,7 +271,8 @@ fn half_resolution_is_the_same_on_both_sides_for_odd_sizes_and_with_a_peak() {
 #[test]
 fn a_lost_device_is_an_error_that_says_what_to_do() {
     let Some(gpu) = device(ForcedLimits::default()) else { return };
-    let mut renderer = GpuRenderer::new(Arc::clone(&gpu), RenderSettings::default(), medium(0.0), sky()).unwrap();
+    let mut renderer =
+        GpuRenderer::new(Arc::clone(&gpu), RenderSettings::default(), medium(0.0), sky(), SolveOn::Device).unwrap();
     renderer.set_frame(frame(tiny())).unwrap();
     gpu.parts().0.destroy();
     let error = renderer.render(&cameras(&tiny())[0]).unwrap_err();

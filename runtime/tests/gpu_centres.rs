@@ -8,7 +8,7 @@ use gpu_common::{cameras, device, difference, radiance, shaded, sky, told};
 use smoke_formats::gaussian::{Gaussian, UnitSpace};
 use smoke_runtime::gpu::centres::{self, CentrePass, DeviceCentres};
 use smoke_runtime::gpu::device::{ForcedLimits, Gpu};
-use smoke_runtime::gpu::renderer::GpuRenderer;
+use smoke_runtime::gpu::renderer::{GpuRenderer, SolveOn};
 use smoke_runtime::gpu::volume::DeviceVolume;
 use smoke_runtime::light::Light;
 use smoke_runtime::medium::field::DensityField;
@@ -146,7 +146,7 @@ fn images_through_the_centres_agree_after_every_kind_of_edit() {
         let (first, other) = (frame(70, 0.05), frame(1, 0.2));
         let camera = cameras(&first.field);
         let mut cpu = Renderer::new(settings, medium(0.4), sky()).unwrap();
-        let mut device = GpuRenderer::new(Arc::clone(&gpu), settings, medium(0.4), sky()).unwrap();
+        let mut device = GpuRenderer::new(Arc::clone(&gpu), settings, medium(0.4), sky(), SolveOn::Device).unwrap();
         let mut same = |cpu: &mut Renderer, device: &mut GpuRenderer, camera: usize, what: &str| {
             let (expected, _) = cpu.render(&cameras(&first.field)[camera]).unwrap();
             let (found, _) = device.render(&cameras(&first.field)[camera]).unwrap();

@@ -10,7 +10,7 @@ use smoke_runtime::gpu::device::{ForcedLimits, Gpu, GpuError};
 use smoke_runtime::gpu::gmres::{self, GmresPass};
 use smoke_runtime::gpu::grid_solve::{DeviceGrids, GridPass, GridProblem};
 use smoke_runtime::gpu::planes::Planes;
-use smoke_runtime::gpu::renderer::GpuRenderer;
+use smoke_runtime::gpu::renderer::{GpuRenderer, SolveOn};
 use smoke_runtime::gpu::scatter::{self, ScatterPass};
 use smoke_runtime::gpu::single::{self, SinglePass};
 use smoke_runtime::gpu::sweep_grid::DeviceSweepGrid;
@@ -336,7 +336,7 @@ fn images_agree_for_a_sun_a_sky_both_and_darkness() {
         let grid = GridSettings { beams: 16, rings: 3, ..GridSettings::default() };
         let settings = RenderSettings { route: Route::Grid(grid), scattering, ..RenderSettings::default() };
         let mut cpu = Renderer::new(settings, coloured(0.0), vec![]).unwrap();
-        let mut device = GpuRenderer::new(gpu.clone(), settings, coloured(0.0), vec![]).unwrap();
+        let mut device = GpuRenderer::new(gpu.clone(), settings, coloured(0.0), vec![], SolveOn::Device).unwrap();
         cpu.set_frame(frame(field.clone())).unwrap();
         device.set_frame(frame(field.clone())).unwrap();
         for (lights, medium) in [

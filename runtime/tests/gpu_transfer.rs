@@ -7,7 +7,7 @@ use glam::{DVec3, Vec3};
 use gpu_common::{cameras, device, difference, plume, radiance, shaded, sky, tiny, told};
 use smoke_formats::gaussian::UnitSpace;
 use smoke_runtime::gpu::device::{ForcedLimits, Gpu, GpuError};
-use smoke_runtime::gpu::renderer::{GpuRenderError, GpuRenderer};
+use smoke_runtime::gpu::renderer::{GpuRenderError, GpuRenderer, SolveOn};
 use smoke_runtime::gpu::transfer::{CELLS, DeviceTransfer, PRODUCT, SOURCE, TransferPass, VIEW_DIRECTIONS};
 use smoke_runtime::gpu::volume::DeviceVolume;
 use smoke_runtime::light::Light;
@@ -313,7 +313,7 @@ fn images_by_transfer_agree_after_every_kind_of_edit() {
     let mut cases = 0;
     for medium in [grey(0.0), coloured(0.5)] {
         let mut cpu = Renderer::new(settings, medium, sky()).unwrap();
-        let mut device = GpuRenderer::new(Arc::clone(&gpu), settings, medium, sky()).unwrap();
+        let mut device = GpuRenderer::new(Arc::clone(&gpu), settings, medium, sky(), SolveOn::Device).unwrap();
         let mut same =
             |cpu: &mut Renderer, device: &mut GpuRenderer, field: &DensityField, camera: usize, what: &str| {
                 let camera = &cameras(field)[camera];
@@ -344,7 +344,7 @@ fn images_by_transfer_agree_after_every_kind_of_edit() {
 fn a_transfer_that_a_device_cannot_hold_is_refused_by_name() {
     let Some(gpu) = device(ForcedLimits { storage_binding: Some(64 << 10) }) else { return };
     let settings = RenderSettings { route: Route::Transfer(TransferSettings::default()), ..RenderSettings::default() };
-    let mut renderer = GpuRenderer::new(gpu, settings, grey(0.5), sky()).unwrap();
+    let mut renderer = GpuRenderer::new(gpu, settings, grey(0.5), sky(), SolveOn::Device).unwrap();
     let field = plume(1);
     renderer.set_frame(frame(field.clone(), grey(0.5))).unwrap();
     let error = renderer.render(&cameras(&field)[0]).unwrap_err();

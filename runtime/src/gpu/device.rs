@@ -28,6 +28,13 @@ pub struct AdapterSummary {
     pub timestamps: bool,
 }
 
+impl AdapterSummary {
+    /// True if it is a driver that computes on the processor.
+    pub fn is_software(&self) -> bool {
+        self.kind == "software"
+    }
+}
+
 /// Which adapter is meant.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Choice {

@@ -6,7 +6,7 @@
 
 use super::centres::{CentrePass, DeviceCentres};
 use super::device::{Gpu, GpuError};
-use super::grid_solve::{DeviceGrids, GridPass};
+use super::grid_solve::{DeviceGrids, GridPass, GridProblem};
 use super::march::{DeviceSky, MarchPass};
 use super::self_test;
 use super::transfer::{DeviceLight, DeviceTransfer, TransferPass};
@@ -19,6 +19,7 @@ use crate::march::{MarchMedium, MarchSettings};
 use crate::medium::field::DensityField;
 use crate::medium::frame::Frame;
 use crate::renderer::{Lit, RenderError, RenderSettings, Renderer, Seconds, Unlit};
+use crate::transport::compensated::grid::route::GridTransport;
 use crate::transport::medium::MediumParameters;
 use glam::DVec3;
 use std::sync::Arc;
@@ -33,6 +34,22 @@ pub enum GpuRenderError {
     /// The device is.
     #[error(transparent)]
     Gpu(#[from] GpuError),
+}
+
+/// What solves the grid route.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SolveOn {
+    /// The device.
+    Device,
+    /// The processor; planes are copied.
+    Processor,
+}
+
+impl SolveOn {
+    /// The faster of them: a software device is the processor, and takes twenty times as long for it.
+    pub fn best(gpu: &Gpu) -> Self {
+        if gpu.summary().is_software() { Self::Processor } else { Self::Device }
+    }
 }
 
 /// What depends on the frame alone.
@@ -58,8 +75,11 @@ pub struct GpuRenderer {
     march_settings: MarchSettings,
     volume_pass: VolumePass,
     sky: Option<DeviceSky>,
+    solve_on: SolveOn,
     grid_pass: GridPass,
     grids: DeviceGrids,
+    /// The frame's grids of the processor, if it solves.
+    transport: Option<GridTransport>,
     source: Option<DeviceSource>,
     centre_pass: CentrePass,
     centres: Option<DeviceCentres>,
@@ -78,6 +98,7 @@ impl GpuRenderer {
         settings: RenderSettings,
         medium: MediumParameters,
         lights: Vec<Light>,
+        solve_on: SolveOn,
     ) -> Result<Self, GpuRenderError> {
         let solver = Renderer::new(settings, medium, lights)?;
         let (march, volume_pass) = (MarchPass::new(&gpu)?, VolumePass::new(&gpu)?);
@@ -92,8 +113,10 @@ impl GpuRenderer {
             march_settings: settings.march,
             volume_pass,
             sky: None,
+            solve_on,
             grid_pass,
             grids,
+            transport: None,
             source: None,
             centre_pass,
             centres: None,
@@ -114,7 +137,7 @@ impl GpuRenderer {
     pub fn set_frame(&mut self, frame: Frame) -> Result<(), RenderError> {
         (self.source, self.centres, self.eye) = (None, None, None);
         (self.transfer, self.light, self.loaded) = (None, None, None);
-        self.grids = DeviceGrids::default();
+        (self.grids, self.transport) = (DeviceGrids::default(), None);
         self.solver.set_frame(frame)
     }
 
@@ -160,7 +183,12 @@ impl GpuRenderer {
         let gpu = &*self.gpu;
         let source = match self.source.take() {
             Some(source) => source,
-            None => self.grid_pass.solve(gpu, &mut self.grids, &problem)?,
+            None if self.solve_on == SolveOn::Device => self.grid_pass.solve(gpu, &mut self.grids, &problem)?,
+            None => {
+                let GridProblem { field, beams, ref medium, scattering, settings } = problem;
+                let transport = self.transport.get_or_insert_with(|| GridTransport::new(settings));
+                DeviceSource::new(gpu, &transport.solve(field, beams, medium, scattering))?
+            }
         };
         let source = self.source.insert(source);
         seconds.source_radiance = start.elapsed().as_secs_f64();
