@@ -176,7 +176,7 @@ fn frame(field: DensityField) -> Frame {
 fn images_agree_after_every_kind_of_edit_and_with_pages_of_few_bricks() {
     let tight = ForcedLimits { storage_binding: Some(4 << 20) };
     let mut cases = 0;
-    for forced in [ForcedLimits::default(), tight] {
+    for (forced, solve_on) in [(ForcedLimits::default(), SolveOn::Processor), (tight, SolveOn::Device)] {
         let Some(gpu) = device(forced) else { return };
         // A software device takes minutes for the default's 64 beams and 50 ordinates.
         let grid = GridSettings { beams: 16, rings: 3, ..GridSettings::default() };
@@ -184,7 +184,7 @@ fn images_agree_after_every_kind_of_edit_and_with_pages_of_few_bricks() {
         let (field, other) = (plume(6), tiny());
         let camera = cameras(&field);
         let mut cpu = Renderer::new(settings, medium(0.4), sky()).unwrap();
-        let mut device = GpuRenderer::new(gpu, settings, medium(0.4), sky(), SolveOn::Device).unwrap();
+        let mut device = GpuRenderer::new(gpu, settings, medium(0.4), sky(), solve_on).unwrap();
         let mut same = |cpu: &mut Renderer, device: &mut GpuRenderer, camera: &Camera, what: &str| {
             let (expected, a) = cpu.render(camera).unwrap();
             let (found, b) = device.render(camera).unwrap();
