@@ -102,6 +102,11 @@ impl ShadedVolume {
         Self { dims: field.dims, nodes, table, world_from_node: field.world_from_node, density_max }
     }
 
+    /// How many bricks have density.
+    pub fn bricks(&self) -> usize {
+        self.nodes.len()
+    }
+
     /// Writes the radiance of all nodes anew: `row(j, k, out)` gives that of the nodes `[.., j, k]` in the first three
     /// components of `out`, which come as zeros, with the density of `field`, the same as at [`Self::of`], in the fourth.
     /// It is asked for rows of bricks with density only, some of them twice.

@@ -364,6 +364,45 @@ fn images_agree_for_a_sun_a_sky_both_and_darkness() {
     told(cases);
 }
 
+/// Minutes on a software device; `SMOKE_BAKE_DATA` says where the real sequence is. Fewer beams and ordinates than by
+/// default, on coarser nodes, which a comparison does not mind.
+#[test]
+#[ignore = "needs the real sequence"]
+fn images_of_the_real_plume_agree_in_three_scenes() {
+    let Some(gpu) = device(ForcedLimits::default()) else { return };
+    let data = std::env::var("SMOKE_BAKE_DATA").unwrap_or_else(|_| "../../shared/data".into());
+    let mut cases = 0;
+    for number in [1020, 1060] {
+        let path = std::path::Path::new(&data).join(format!("plume/plume.{number:04}.vdb"));
+        let grid = smoke_formats::volume::read(&path, "density").unwrap();
+        let field = DensityField::from_box(grid.origin, grid.dims, &grid.values, grid.world_from_index);
+        let settings =
+            GridSettings { beams: 16, rings: 3, single_step: 2, multiple_step: 4, ..GridSettings::default() };
+        let settings = RenderSettings { route: Route::Grid(settings), ..RenderSettings::default() };
+        let mut cpu = Renderer::new(settings, grey(0.0), vec![]).unwrap();
+        let mut device = GpuRenderer::new(gpu.clone(), settings, grey(0.0), vec![], SolveOn::Device).unwrap();
+        cpu.set_frame(frame(field.clone())).unwrap();
+        device.set_frame(frame(field.clone())).unwrap();
+        for (name, lights, medium) in [
+            ("sun, g = 0.85", vec![sky().remove(1)], grey(0.85)),
+            ("sky, g = 0", vec![sky().remove(0)], grey(0.0)),
+            ("sky and sun, g = 0.5, coloured", sky(), coloured(0.5)),
+        ] {
+            cpu.set_lights(lights.clone()).unwrap();
+            cpu.set_medium(medium).unwrap();
+            device.set_lights(lights).unwrap();
+            device.set_medium(medium).unwrap();
+            let (expected, _) = cpu.render(&cameras(&field)[0]).unwrap();
+            let (found, _) = device.render(&cameras(&field)[0]).unwrap();
+            let off = difference(&radiance(&expected), &radiance(&found));
+            eprintln!("plume {number}, {name}: {off:.1e}");
+            assert!(off <= IMAGE, "{off}");
+            cases += 1;
+        }
+    }
+    told(cases);
+}
+
 #[test]
 fn an_empty_frame_and_one_too_large_for_the_device_are_told_apart() {
     let Some(gpu) = device(ForcedLimits { storage_binding: Some(64 << 10) }) else { return };
