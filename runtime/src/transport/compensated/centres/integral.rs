@@ -182,6 +182,7 @@ fn weighted(row: &[f32], v: &[f64]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::transport::compensated::centres::kernels::TOLERANCE;
     use crate::transport::compensated::centres::testing::{Pcg, cloud, points};
     use smoke_formats::gaussian::Gaussian;
 

@@ -13,7 +13,7 @@ use crate::transport::compensated::gmres::{Solved, solve};
 use crate::transport::medium::BandedMedium;
 
 /// Relative residual of the solve: ten times the rounding of K.
-const TOLERANCE: f64 = 1e-6;
+pub(super) const TOLERANCE: f64 = 1e-6;
 /// Products with K, at most, per channel.
 const ITERATIONS: usize = 120;
 
