@@ -16,6 +16,7 @@ use crate::medium::field::DensityField;
 use crate::medium::frame::Frame;
 use crate::shaded_volume::ShadedVolume;
 use crate::transport::compensated::centres::incident::incident;
+use crate::transport::compensated::centres::kernels::{CentreKernels, Processor};
 use crate::transport::compensated::centres::route::{CentreError, CentreSettings, CentreTransport, MultipleScattering};
 use crate::transport::compensated::centres::source::{CentreSource, UnitPlacement};
 use crate::transport::compensated::grid::route::{GridSettings, GridTransport};
@@ -159,6 +160,8 @@ enum Transport {
 /// See the module's head.
 pub struct Renderer {
     settings: RenderSettings,
+    /// Who computes the heavy parts of the route through centres.
+    kernels: Arc<dyn CentreKernels>,
     medium: MediumParameters,
     lights: Vec<Light>,
     /// The lights as beams, for the grid route.
@@ -177,7 +180,13 @@ impl Renderer {
         check(&settings)?;
         check_lights(&lights)?;
         let (beams, sky, loaded, source, shaded) = (None, None, None, None, None);
-        Ok(Self { settings, medium, lights, beams, sky, loaded, source, shaded })
+        Ok(Self { settings, kernels: Arc::new(Processor), medium, lights, beams, sky, loaded, source, shaded })
+    }
+
+    /// Other kernels for the frames to come.
+    #[cfg(feature = "gpu")]
+    pub(crate) fn set_kernels(&mut self, kernels: Arc<dyn CentreKernels>) {
+        self.kernels = kernels;
     }
 
     /// Another frame.
@@ -198,7 +207,9 @@ impl Renderer {
                     ScatteringOrder::All => settings.multiple,
                 };
                 let settings = CentreSettings { order: self.settings.sh_order, multiple, ..settings };
-                Transport::Centres(Box::new(CentreTransport::new(&frame.gaussians, settings)?), placement)
+                let kernels = Arc::clone(&self.kernels);
+                let transport = CentreTransport::with_kernels(&frame.gaussians, settings, kernels)?;
+                Transport::Centres(Box::new(transport), placement)
             }
             Route::Transfer(settings) => {
                 check_box(frame.field.dims)?;

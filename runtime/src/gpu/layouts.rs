@@ -465,14 +465,58 @@ layout! {
     }
 }
 
+layout! {
+    /// Depths from the centres: members as `depth.wgsl` describes them.
+    CentreDepth {
+        /// Gaussians.
+        count: u32,
+        /// Directions with their padding.
+        directions: u32,
+        /// Nothing.
+        pad_0: u32,
+        /// Nothing.
+        pad_1: u32,
+    }
+}
+
+layout! {
+    /// Single scattering at the centres: members as `centres/single.wgsl` describes them.
+    CentreSingle {
+        /// Optical depth over depth.
+        scale: [f32; 4],
+        /// Centres.
+        count: u32,
+        /// Directions with their padding.
+        directions: u32,
+        /// Coefficients a centre.
+        coefficients: u32,
+        /// Nothing.
+        pad_0: u32,
+    }
+}
+
+layout! {
+    /// A plane of the product between the centres: members as `integral.wgsl` describes them.
+    CentreProduct {
+        /// Centres.
+        count: u32,
+        /// First of the pair of harmonics.
+        a: u32,
+        /// Second of them.
+        b: u32,
+        /// Nothing.
+        pad_0: u32,
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::gpu::pass::PRELUDE;
-    use crate::gpu::{centres, decode, gmres, march, scatter, single, transfer, volume_pass};
+    use crate::gpu::{centre_solve, centres, decode, gmres, march, scatter, single, transfer, volume_pass};
     use naga::TypeInner;
 
-    const SHADERS: [(&str, &str); 12] = [
+    const SHADERS: [(&str, &str); 15] = [
         ("march.wgsl", march::SHADER),
         ("route.wgsl", volume_pass::SHADER),
         ("centres/volume_pass.wgsl", centres::SHADER),
@@ -485,10 +529,13 @@ mod tests {
         ("single.wgsl", single::SHADER),
         ("scatter.wgsl", scatter::SHADER),
         ("gmres.wgsl", gmres::SHADER),
+        ("centres/depth.wgsl", centre_solve::DEPTH),
+        ("centres/single.wgsl", centre_solve::SINGLE),
+        ("centres/integral.wgsl", centre_solve::PRODUCT),
     ];
     type Members = &'static [(&'static str, usize, usize)];
     /// Every structure of every shader.
-    const LAYOUTS: [(&str, usize, Members); 16] = [
+    const LAYOUTS: [(&str, usize, Members); 19] = [
         ("March", size_of::<March>(), March::MEMBERS),
         ("Pixel", size_of::<Pixel>(), Pixel::MEMBERS),
         ("Environment", size_of::<Environment>(), Environment::MEMBERS),
@@ -505,6 +552,9 @@ mod tests {
         ("Single", size_of::<Single>(), Single::MEMBERS),
         ("Scatter", size_of::<Scatter>(), Scatter::MEMBERS),
         ("Gmres", size_of::<Gmres>(), Gmres::MEMBERS),
+        ("CentreDepth", size_of::<CentreDepth>(), CentreDepth::MEMBERS),
+        ("CentreSingle", size_of::<CentreSingle>(), CentreSingle::MEMBERS),
+        ("CentreProduct", size_of::<CentreProduct>(), CentreProduct::MEMBERS),
     ];
 
     fn parse(name: &str, text: &str) -> naga::Module {

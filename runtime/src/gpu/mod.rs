@@ -3,9 +3,11 @@
 //! A shader lies beside the file whose work it does, under the same name: `march.wgsl` beside `march.rs`. Here are the
 //! device, the layouts that both sides share, and the host's side of each pass. Fields are storage buffers read with
 //! written-out trilinear interpolation, in f32: filtering hardware keeps eight bits of a weight.
-//! On the device: the grid route (sweeps, gather, GMRES), the volume passes, the light and view of transfer, the view pass; and
-//! decoding, which the renderer does not use yet. On the processor: the solution at centres.
+//! On the device: the grid route (sweeps, gather, GMRES), the centres' depths,
+//! single scattering and products of the solve, the volume passes, the light and view of transfer, the view pass; and
+//! decoding, which the renderer does not use yet. On the processor: the matrix between the centres.
 
+pub mod centre_solve;
 pub mod centres;
 pub mod decode;
 pub mod device;

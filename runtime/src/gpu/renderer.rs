@@ -1,9 +1,10 @@
 //! The calls of [`Renderer`], with the grid route, transfer and the view pass on a device.
 //!
-//! Decoding is the processor's, and so are the solution at centres and the projection of light onto transfer: their results
-//! are copied. Kept until an edit makes them void: grids, planes, clusters and their light, bricks and backdrop on the
+//! Decoding is the processor's, and so is the projection of light onto transfer, whose result is copied. The
+//! solution at centres is the solver's, with the device's kernels ([`super::centre_solve`]). Kept until an edit makes them void: grids, planes, clusters and their light, bricks and backdrop on the
 //! device. So other light costs sweeps and solve, another view the volume pass and the march.
 
+use super::centre_solve::DeviceKernels;
 use super::centres::{CentrePass, DeviceCentres};
 use super::device::{Gpu, GpuError};
 use super::grid_solve::{DeviceGrids, GridPass, GridProblem};
@@ -36,12 +37,12 @@ pub enum GpuRenderError {
     Gpu(#[from] GpuError),
 }
 
-/// What solves the grid route.
+/// What solves the grid route, and computes the heavy parts of the route through centres.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SolveOn {
     /// The device.
     Device,
-    /// The processor; planes are copied.
+    /// The processor; what it finds is copied.
     Processor,
 }
 
@@ -100,7 +101,10 @@ impl GpuRenderer {
         lights: Vec<Light>,
         solve_on: SolveOn,
     ) -> Result<Self, GpuRenderError> {
-        let solver = Renderer::new(settings, medium, lights)?;
+        let mut solver = Renderer::new(settings, medium, lights)?;
+        if solve_on == SolveOn::Device {
+            solver.set_kernels(Arc::new(DeviceKernels::new(Arc::clone(&gpu))?));
+        }
         let (march, volume_pass) = (MarchPass::new(&gpu)?, VolumePass::new(&gpu)?);
         self_test::check(&gpu, &march)?;
         let transfer_pass = TransferPass::new(&gpu)?;

@@ -102,6 +102,11 @@ impl DirectionalDepth {
         Self { stride, values }
     }
 
+    /// All of them, centre after centre, with the directions' padding.
+    pub fn values(&self) -> &[f32] {
+        &self.values
+    }
+
     /// Depths from centre `i`, in the order of the directions, with their padding; relative density times unit length.
     pub fn of(&self, i: usize) -> &[f32] {
         &self.values[i * self.stride..(i + 1) * self.stride]

@@ -19,12 +19,12 @@
 use rayon::prelude::*;
 
 use crate::medium::gaussian_points::GaussianPoints;
-use crate::sphere::harmonics::{BAND, MAX_ORDER, evaluate};
+use crate::sphere::harmonics::evaluate;
 use crate::sphere::quadrature::Directions;
 use crate::transport::compensated::centres::decay::decay;
 use crate::transport::compensated::centres::depth::DirectionalDepth;
+use crate::transport::compensated::centres::kernels::{KernelError, TransportMatrix};
 use crate::transport::compensated::centres::overlap::OverlapGrid;
-use crate::transport::compensated::gmres::{Solved, solve};
 
 /// Steps along a ray, from the centre to where the ray leaves all Gaussians.
 const STEPS: usize = 64;
@@ -32,10 +32,6 @@ const STEPS: usize = 64;
 const OPAQUE: f32 = 1e-6;
 /// Rows of one task.
 const CHUNK: usize = 8;
-/// Relative residual of the solve: ten times the rounding of K.
-const TOLERANCE: f64 = 1e-6;
-/// Products with K, at most, per channel.
-const ITERATIONS: usize = 120;
 
 /// The transport matrix K of one frame at one extinction.
 #[derive(Clone, Debug)]
@@ -100,13 +96,22 @@ impl IntegralTransport {
         Self { count: n, bands, planes }
     }
 
-    /// The number of bands of the matrix.
-    pub fn bands(&self) -> usize {
+    /// Planes (a, b), a <= b, of the symmetric products of harmonics, each with its pair; n x n, receivers by rows.
+    pub fn planes(&self) -> impl Iterator<Item = ((usize, usize), &[f32])> {
+        pairs(self.bands).into_iter().zip(self.planes.iter().map(Vec::as_slice))
+    }
+}
+
+impl TransportMatrix for IntegralTransport {
+    fn count(&self) -> usize {
+        self.count
+    }
+
+    fn bands(&self) -> usize {
         self.bands
     }
 
-    /// `out = K v`: harmonics of the light that arrives; coefficient `a` of centre i at `a * n + i` in both.
-    pub fn product(&self, v: &[f64], out: &mut [f64]) {
+    fn product(&self, v: &[f64], out: &mut [f64]) -> Result<(), KernelError> {
         let (n, coefficients) = (self.count, self.bands * self.bands);
         let pairs = pairs(self.bands);
         let rows: Vec<[f64; 4]> = (0..n)
@@ -129,52 +134,7 @@ impl IntegralTransport {
                 out[a * n + i] = *sum;
             }
         }
-    }
-
-    /// Adds multiple scattering to `radiance` (single scattering, `order^2` coefficients a centre) in one channel.
-    ///
-    /// Solves `x = J_ss + F K x` on the matrix's bands; bands above keep single scattering. `start` (same layout as
-    /// `radiance`) speeds up a solve after a small edit. Radiance means below zero, possible only where the solve
-    /// stopped early, are set to zero.
-    pub fn add(
-        &self,
-        radiance: &mut [[f32; 3]],
-        order: usize,
-        channel: usize,
-        gains: &[f32; MAX_ORDER],
-        start: Option<&[[f32; 3]]>,
-    ) -> Solved {
-        let (n, stride, coefficients) = (self.count, order * order, (self.bands * self.bands).min(order * order));
-        let size = n * self.bands * self.bands;
-        let gather = |from: &[[f32; 3]]| -> Vec<f64> {
-            let mut out = vec![0.0; size];
-            for i in 0..n {
-                (0..coefficients).for_each(|a| out[a * n + i] = f64::from(from[i * stride + a][channel]));
-            }
-            out
-        };
-        let b = gather(radiance);
-        let mut x = start.filter(|s| s.len() == radiance.len()).map_or_else(|| b.clone(), gather);
-        let gain = |a: usize| if a < coefficients { f64::from(gains[BAND[a]]) } else { 0.0 };
-        let solved = solve(
-            |v, out| {
-                self.product(v, out);
-                for (k, (out, v)) in out.iter_mut().zip(v).enumerate() {
-                    *out = v - gain(k / n) * *out;
-                }
-            },
-            &b,
-            &mut x,
-            TOLERANCE,
-            ITERATIONS,
-        );
-        for i in 0..n {
-            for a in 0..coefficients {
-                let value = x[a * n + i] as f32;
-                radiance[i * stride + a][channel] = if a == 0 { value.max(0.0) } else { value };
-            }
-        }
-        solved
+        Ok(())
     }
 }
 
@@ -222,6 +182,7 @@ fn weighted(row: &[f32], v: &[f64]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::transport::compensated::centres::kernels::TOLERANCE;
     use crate::transport::compensated::centres::testing::{Pcg, cloud, points};
     use smoke_formats::gaussian::Gaussian;
 
@@ -267,7 +228,7 @@ mod tests {
         let case = case(&cloud(60, 11));
         for (scale, g, bands) in [(1e-3, 0.0, 1), (1.0, 0.0, 1), (10.0, 0.0, 1), (10.0, 0.5, 2), (60.0, -0.4, 2)] {
             let mut j = case.single(scale, 1.0, g);
-            let solved = case.matrix(scale, bands).add(&mut j, 2, 0, &[1.0, g, 0.0, 0.0, 0.0, 0.0], None);
+            let solved = case.matrix(scale, bands).add(&mut j, 2, 0, &[1.0, g, 0.0, 0.0, 0.0, 0.0], None).unwrap();
             assert!(solved.residual < TOLERANCE, "{solved:?}");
             for (k, j) in j.iter().enumerate() {
                 // The residual 1e-6 grows by 1 / (1 - spectral radius), here below 300.
@@ -383,7 +344,7 @@ mod tests {
         let case = case(&few());
         let (scale, albedo, walks) = (8.0, 0.9, 20_000);
         let mut j = case.single(scale, albedo as f32, 0.0);
-        case.matrix(scale, 1).add(&mut j, 2, 0, &[albedo as f32, 0.0, 0.0, 0.0, 0.0, 0.0], None);
+        case.matrix(scale, 1).add(&mut j, 2, 0, &[albedo as f32, 0.0, 0.0, 0.0, 0.0, 0.0], None).unwrap();
         let mut pcg = Pcg::new(21);
         for i in 0..5 {
             let (mut sum, mut squares) = (0.0, 0.0);
@@ -419,7 +380,7 @@ mod tests {
         let one = case(&cloud(1, 3));
         for scale in [1e-6, 1.0, 100.0, 1e6] {
             let mut j = one.single(scale, 0.99, 0.0);
-            one.matrix(scale, 1).add(&mut j, 2, 0, &[0.99, 0.0, 0.0, 0.0, 0.0, 0.0], None);
+            one.matrix(scale, 1).add(&mut j, 2, 0, &[0.99, 0.0, 0.0, 0.0, 0.0, 0.0], None).unwrap();
             // One equation: J = albedo tau / (1 - albedo (1 - tau)).
             let t: f64 = (0..98)
                 .map(|q| f64::from(one.directions.weights[q]) * (-scale * f64::from(one.depth.of(0)[q])).exp())
@@ -439,7 +400,7 @@ mod tests {
         let case = case(&gaussians);
         for scale in [0.0, 1e-6, 1.0, 1e3, 1e6, 1e12] {
             let mut j = case.single(scale, 1.0, 0.9);
-            case.matrix(scale, 2).add(&mut j, 2, 0, &[1.0, 0.9, 0.0, 0.0, 0.0, 0.0], None);
+            case.matrix(scale, 2).add(&mut j, 2, 0, &[1.0, 0.9, 0.0, 0.0, 0.0, 0.0], None).unwrap();
             assert!(j.iter().all(|v| v[0].is_finite()), "{scale}");
             assert!(j.chunks(4).all(|j| j[0][0] >= 0.0 && j[0][0] < 1.01 * ROOT), "{scale}");
             assert!((j[0][0] - j[4][0]).abs() <= 1e-4 * ROOT, "coincident Gaussians see the same");
@@ -452,8 +413,8 @@ mod tests {
         let (matrix, gains) = (case.matrix(30.0, 1), [0.95, 0.0, 0.0, 0.0, 0.0, 0.0]);
         let single = case.single(30.0, 0.95, 0.0);
         let (mut cold, mut warm) = (single.clone(), single.clone());
-        let first = matrix.add(&mut cold, 2, 0, &gains, None);
-        let second = matrix.add(&mut warm, 2, 0, &gains, Some(&cold));
+        let first = matrix.add(&mut cold, 2, 0, &gains, None).unwrap();
+        let second = matrix.add(&mut warm, 2, 0, &gains, Some(&cold)).unwrap();
         assert!(first.iterations > 3 && second.iterations <= 1, "{first:?} {second:?}");
         assert!(cold.iter().zip(&warm).all(|(a, b)| (a[0] - b[0]).abs() < 2e-4));
     }

@@ -6,6 +6,7 @@ pub mod diffusion;
 pub mod exponential;
 pub mod incident;
 pub mod integral;
+pub mod kernels;
 pub mod overlap;
 pub mod route;
 pub mod single;

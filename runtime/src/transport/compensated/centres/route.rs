@@ -10,12 +10,16 @@ use crate::transport::compensated::centres::depth::{DirectionalDepth, harmonic_d
 use crate::transport::compensated::centres::diffusion::{Channel, Diffusion};
 use crate::transport::compensated::centres::exponential::Exponential;
 use crate::transport::compensated::centres::integral::IntegralTransport;
+use crate::transport::compensated::centres::kernels::{
+    Attenuation, CentreKernels, KernelError, Processor, TransportMatrix,
+};
 use crate::transport::compensated::centres::overlap::OverlapGrid;
 use crate::transport::compensated::centres::single::{
-    Basis, CentreRadiance, IncidentRadiance, evaluate_depth, gains, scatter_directions, scatter_harmonics,
+    Basis, CentreRadiance, IncidentRadiance, evaluate_depth, gains, scatter_harmonics,
 };
 use crate::transport::medium::{MediumError, MediumParameters};
 use smoke_formats::gaussian::Gaussian;
+use std::sync::Arc;
 
 /// How light that scatters more than once is found at the centres.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -57,6 +61,9 @@ pub enum CentreError {
     /// A medium parameter out of range.
     #[error(transparent)]
     Medium(#[from] MediumError),
+    /// The device that computes failed.
+    #[error(transparent)]
+    Kernel(#[from] KernelError),
     /// A setting, length or light out of range.
     #[error("{name}: found {found}, expected {expected}")]
     Input {
@@ -79,6 +86,7 @@ impl CentreError {
 #[derive(Debug)]
 pub struct CentreTransport {
     settings: CentreSettings,
+    kernels: Arc<dyn CentreKernels>,
     points: GaussianPoints,
     directions: Directions,
     basis: Basis,
@@ -91,12 +99,21 @@ pub struct CentreTransport {
     grid: Option<OverlapGrid>,
     diffusion: Option<Diffusion>,
     /// Transport matrices of the last medium, by the bits of their optical scale.
-    matrices: Vec<(u64, IntegralTransport)>,
+    matrices: Vec<(u64, Box<dyn TransportMatrix>)>,
 }
 
 impl CentreTransport {
-    /// Checks the Gaussians and computes what depends on the frame alone.
+    /// [`Self::with_kernels`] of the processor.
     pub fn new(gaussians: &[Gaussian], settings: CentreSettings) -> Result<Self, CentreError> {
+        Self::with_kernels(gaussians, settings, Arc::new(Processor))
+    }
+
+    /// Checks the Gaussians and computes what depends on the frame alone; `kernels` compute the heavy parts.
+    pub fn with_kernels(
+        gaussians: &[Gaussian],
+        settings: CentreSettings,
+        kernels: Arc<dyn CentreKernels>,
+    ) -> Result<Self, CentreError> {
         if !(1..=MAX_ORDER).contains(&settings.order) {
             return Err(CentreError::input("order", settings.order, "1 to 6"));
         }
@@ -109,10 +126,12 @@ impl CentreTransport {
         let direct = settings.exponential == Exponential::Direct;
         let linear = matches!(settings.exponential, Exponential::OptimalLinear | Exponential::Hybrid);
         let pointwise = settings.exponential == Exponential::Pointwise;
+        let depth = if direct || integral { Some(kernels.depth(&points, &directions)?) } else { None };
         Ok(Self {
             settings,
+            kernels,
             basis: Basis::new(settings.order, &directions),
-            depth: (direct || integral).then(|| DirectionalDepth::new(&points, &directions)),
+            depth,
             evaluated: pointwise.then(|| evaluate_depth(&harmonic_depth(&points, MAX_ORDER), MAX_ORDER, &directions)),
             harmonics: linear.then(|| harmonic_depth(&points, settings.order)),
             grid: integral.then(|| OverlapGrid::new(&points)),
@@ -166,7 +185,14 @@ impl CentreTransport {
         let sampled = light.sampled(&self.directions);
         let single = match (self.settings.exponential, &self.depth, &self.evaluated, &self.harmonics) {
             (Exponential::Direct, Some(depth), ..) | (Exponential::Pointwise, _, Some(depth), _) => {
-                scatter_directions(depth, n, scale, &banded, &sampled, &self.basis)
+                self.kernels.single(&Attenuation {
+                    depth,
+                    count: n,
+                    optical_scale: scale,
+                    medium: &banded,
+                    radiance: &sampled,
+                    basis: &self.basis,
+                })?
             }
             (exponential, _, _, harmonics) => {
                 let squared = exponential == Exponential::Hybrid;
@@ -195,13 +221,17 @@ impl CentreTransport {
             self.matrices.retain(|(bits, matrix)| wanted.contains(bits) && matrix.bands() >= bands);
             for &c in &active {
                 let bits = scale[c].to_bits();
-                let at = self.matrices.iter().position(|(b, _)| *b == bits).unwrap_or_else(|| {
-                    let matrix = IntegralTransport::new(&self.points, grid, &self.directions, depth, scale[c], bands);
-                    self.matrices.push((bits, matrix));
-                    self.matrices.len() - 1
-                });
+                let at = match self.matrices.iter().position(|(b, _)| *b == bits) {
+                    Some(at) => at,
+                    None => {
+                        let (points, directions) = (&self.points, &self.directions);
+                        let matrix = IntegralTransport::new(points, grid, directions, depth, scale[c], bands);
+                        self.matrices.push((bits, self.kernels.matrix(matrix)?));
+                        self.matrices.len() - 1
+                    }
+                };
                 let start = start.map(|s| &s.coefficients[..]);
-                self.matrices[at].1.add(&mut out.coefficients, order, c, &gains(&banded, c), start);
+                self.matrices[at].1.add(&mut out.coefficients, order, c, &gains(&banded, c), start)?;
             }
         }
         for c in 0..3 {

@@ -104,6 +104,11 @@ impl Basis {
         Self { values }
     }
 
+    /// `W_q y_k(q)`, coefficient by coefficient, each padded like the directions.
+    pub fn rows(&self) -> &[Vec<f32>] {
+        &self.values
+    }
+
     /// Coefficients of the function with the given (padded) values along the directions.
     #[inline(always)]
     pub fn project(&self, samples: &[f32], out: &mut [f32]) {
