@@ -19,11 +19,29 @@ use smoke_runtime::medium::frame::Frame;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
+/// Wall seconds of stages, by name; those of different frames overlap.
+type Stages = Vec<(&'static str, f64)>;
+
+/// A frame, ready to be lit.
+struct Decoded {
+    position: usize,
+    frame: Frame,
+    seconds: f64,
+}
+
+/// An image that is not written yet.
+struct Made {
+    position: usize,
+    path: PathBuf,
+    image: Image,
+    seconds: Stages,
+}
+
 /// What is told of one frame.
 struct Report {
     frame: i32,
     path: PathBuf,
-    seconds: Vec<(&'static str, f64)>,
+    seconds: Stages,
     figures: Value,
     clamped: usize,
 }
@@ -47,7 +65,7 @@ pub struct Job<'a> {
 /// Steps of progress that a frame counts for.
 const STEPS: u64 = 1000;
 
-/// Renders the frames, one after the other, each by all threads.
+/// Renders the frames, one after the other.
 pub fn run(args: &RenderArgs) -> Result<(), Failure> {
     let device = Device::open(&args.device)?;
     let stage = Stage::read(&args.scene, &changes(args))?;
@@ -80,12 +98,7 @@ pub fn run(args: &RenderArgs) -> Result<(), Failure> {
     let reports = pool.install(|| -> Result<Vec<Report>, Failure> {
         let mut maker =
             method.maker(&stage, &device).map_err(|e| Failure::work(format!("{}: {e}", args.scene.display())))?;
-        let mut reports = Vec::with_capacity(frames.len());
-        for &position in &frames {
-            let path = names.path(numbers[position]);
-            reports.push(job.frame(position, &mut maker, path, &progress)?);
-        }
-        Ok(reports)
+        job.sequence(&frames, |position| names.path(numbers[position]), &mut maker, &progress)
     })?;
     progress.finish();
     let megapixels = f64::from(scene.width) * f64::from(scene.height) * 1e-6;
@@ -124,22 +137,61 @@ pub fn document(method: &Method, detail: Detail, scene: &Scene) -> Value {
 }
 
 impl Job<'_> {
-    fn frame(&self, position: usize, maker: &mut Maker, path: PathBuf, progress: &Progress) -> Result<Report, Failure> {
-        let number = self.pack.frames()[position].frame;
+    /// Makes and writes the images of `frames`. While one is made, the next frame is decoded and the image before is
+    /// written: a graphics device does not wait for the processor.
+    fn sequence(
+        &self,
+        frames: &[usize],
+        path: impl Fn(usize) -> PathBuf + Sync,
+        maker: &mut Maker,
+        progress: &Progress,
+    ) -> Result<Vec<Report>, Failure> {
+        let mut reports = Vec::with_capacity(frames.len());
+        let mut decoded = frames.first().map(|&position| self.decode(position));
+        let mut before: Option<Made> = None;
+        for (turn, &position) in frames.iter().enumerate() {
+            let frame = decoded.take();
+            let (made, (next, written)) = rayon::join(
+                || frame.map(|frame| self.make(frame?, maker, progress)).transpose(),
+                || {
+                    let next = || frames.get(turn + 1).map(|&position| self.decode(position));
+                    rayon::join(next, || before.take().map(|made| self.finish(made)))
+                },
+            );
+            reports.extend(written.transpose()?);
+            before = made?.map(|(image, seconds)| Made { position, path: path(position), image, seconds });
+            decoded = next;
+        }
+        reports.extend(before.map(|made| self.finish(made)).transpose()?);
+        Ok(reports)
+    }
+
+    fn decode(&self, position: usize) -> Result<Decoded, Failure> {
         let start = Instant::now();
         let frame = read(self.pack, position, &self.method, self.detail)?;
-        let mut seconds = vec![("decode", start.elapsed().as_secs_f64())];
+        Ok(Decoded { position, frame, seconds: start.elapsed().as_secs_f64() })
+    }
+
+    /// The image, and the seconds of decoding and of its stages.
+    fn make(&self, decoded: Decoded, maker: &mut Maker, progress: &Progress) -> Result<(Image, Stages), Failure> {
         let mut steps = 0;
         let mut advance = |part: f64| {
             let now = (part * STEPS as f64) as u64;
             progress.advance(now.saturating_sub(steps));
             steps = steps.max(now);
         };
-        let image = self.image(position, frame, maker, &mut advance)?;
+        let image = self.image(decoded.position, decoded.frame, maker, &mut advance)?;
         advance(1.0);
+        let mut seconds = vec![("decode", decoded.seconds)];
+        seconds.extend_from_slice(&image.seconds);
+        Ok((image, seconds))
+    }
+
+    fn finish(&self, made: Made) -> Result<Report, Failure> {
+        let Made { position, path, image, mut seconds } = made;
+        let number = self.pack.frames()[position].frame;
         let start = Instant::now();
         let clamped = self.write(number, &image, &path)?;
-        seconds.extend_from_slice(&image.seconds);
         seconds.push(("write", start.elapsed().as_secs_f64()));
         Ok(Report { frame: number, path, seconds, figures: image.figures, clamped })
     }

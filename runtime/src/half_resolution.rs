@@ -8,8 +8,9 @@
 //! bleeds. Only the medium's part is read between rays: what is behind it is added for every pixel of the image.
 //! Cost: a quarter of the rays and those of the pixels that differ (measured: `docs/decisions/032-left-out-terms.md`).
 
+use crate::camera::Camera;
 use crate::film::{Film, Pixel};
-use crate::march::View;
+use crate::march::Lens;
 use glam::Vec3A;
 use rayon::prelude::*;
 
@@ -17,40 +18,41 @@ use rayon::prelude::*;
 /// root mean square. Halving it takes a third more rays and a third off the error.
 const ALIKE: f32 = 0.1;
 
-/// Marches a film.
-pub(crate) fn film(view: &View) -> Film {
-    let (width, height) = (view.camera.width, view.camera.height);
-    let coarse = coarse(view);
-    let bright = ALIKE * brightness(&coarse);
-    let across: Vec<Place> = (0..width).map(|x| Place::of(x, width)).collect();
-    let mut film = Film::new(width, height);
-    film.pixels.par_chunks_mut(width).enumerate().for_each(|(y, row)| {
-        let down = Place::of(y, height);
-        let mut apart = Vec::new();
-        for (x, (pixel, across)) in row.iter_mut().zip(&across).enumerate() {
-            let near = Near::of(&coarse, across, &down);
-            if near.is_within(ALIKE, bright) {
-                *pixel = view.in_front(near.between(across.fraction, down.fraction), x, y);
-            } else {
-                apart.push(x);
-            }
-        }
-        apart.iter().zip(view.row(y, &apart)).for_each(|(&x, pixel)| row[x] = pixel);
-    });
-    film
+/// Columns and rows of the coarse film.
+pub(crate) fn coarse_size(camera: &Camera) -> [usize; 2] {
+    [camera.width.div_ceil(2), camera.height.div_ceil(2)]
 }
 
-/// The medium alone, on coarse pixels.
-fn coarse(view: &View) -> Film {
-    let sides = [view.camera.width, view.camera.height];
-    let [width, height] = sides.map(|side| side.div_ceil(2));
-    let size = [sides[0] as f64 / width as f64, sides[1] as f64 / height as f64];
+/// A film of which the medium alone is `coarse`, of [`coarse_size`]; `march` gives pixels with all that is behind them, by
+/// column and row, which are asked for row by row.
+pub(crate) fn film<E>(
+    lens: &Lens,
+    coarse: &Film,
+    march: impl FnOnce(&[[usize; 2]]) -> Result<Vec<Pixel>, E>,
+) -> Result<Film, E> {
+    let (width, height) = (lens.camera.width, lens.camera.height);
+    let bright = ALIKE * brightness(coarse);
+    let across: Vec<Place> = (0..width).map(|x| Place::of(x, width)).collect();
     let mut film = Film::new(width, height);
-    film.pixels.par_chunks_mut(width).enumerate().for_each(|(j, row)| {
-        let corners = (0..width).map(|i| [i as f64 * size[0], j as f64 * size[1]]);
-        row.copy_from_slice(&view.medium_alone(corners, size));
-    });
-    film
+    let rows = film.pixels.par_chunks_mut(width.max(1)).enumerate();
+    let apart: Vec<[usize; 2]> = rows
+        .flat_map_iter(|(y, row)| {
+            let down = Place::of(y, height);
+            let mut apart = Vec::new();
+            for (x, (pixel, across)) in row.iter_mut().zip(&across).enumerate() {
+                let near = Near::of(coarse, across, &down);
+                if near.is_within(ALIKE, bright) {
+                    *pixel = lens.in_front(near.between(across.fraction, down.fraction), x, y);
+                } else {
+                    apart.push([x, y]);
+                }
+            }
+            apart
+        })
+        .collect();
+    let marched = march(&apart)?;
+    apart.iter().zip(marched).for_each(|(&[x, y], pixel)| film.pixels[x + width * y] = pixel);
+    Ok(film)
 }
 
 /// Root mean square radiance of the pixels with smoke, over all channels; 0 without any.
@@ -122,7 +124,6 @@ impl Near {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::camera::Camera;
     use crate::march::{Backdrop, Black, MarchMedium, MarchSettings, march};
     use crate::shaded_volume::ShadedVolume;
     use glam::{DAffine3, DVec3};

@@ -16,6 +16,7 @@ use crate::shaded_volume::{BRICK, BRICK_NODES, EMPTY, SIDE, ShadedVolume};
 use glam::{DAffine3, DVec3, Vec4};
 use multiversion::multiversion;
 use rayon::prelude::*;
+use std::convert::Infallible;
 
 /// Node of the last cell of a brick.
 const LAST_CELL: usize = (BRICK - 1) * (1 + SIDE + SIDE * SIDE);
@@ -142,9 +143,12 @@ pub fn march(
     let node_from_world = volume.world_from_node.inverse();
     let ds = sample_distance(&volume.world_from_node, volume.density_max, settings.step, medium.sigma_t);
     let origin = node_from_world.transform_point3(camera.position);
-    let view = View { volume, camera, medium, backdrop, node_from_world, origin, ds, settings };
+    let lens = Lens { camera, medium, backdrop, settings };
+    let view = View { lens, volume, node_from_world, origin, ds };
     if settings.half_resolution {
-        return half_resolution::film(&view);
+        let coarse = view.medium_alone(half_resolution::coarse_size(camera));
+        let Ok(film) = half_resolution::film::<Infallible>(&lens, &coarse, |apart| Ok(view.pixels(apart)));
+        return film;
     }
     let mut film = Film::new(camera.width, camera.height);
     let columns: Vec<usize> = (0..camera.width).collect();
@@ -155,22 +159,28 @@ pub fn march(
     film
 }
 
-/// All that pixels are marched with.
-pub(crate) struct View<'a> {
-    volume: &'a ShadedVolume,
+/// The rays of pixels, and what is behind the medium.
+#[derive(Clone, Copy)]
+pub(crate) struct Lens<'a> {
     /// Where it is seen from.
     pub(crate) camera: &'a Camera,
-    medium: &'a MarchMedium,
-    backdrop: &'a dyn Backdrop,
+    pub(crate) medium: &'a MarchMedium,
+    pub(crate) backdrop: &'a dyn Backdrop,
+    pub(crate) settings: &'a MarchSettings,
+}
+
+/// All that pixels are marched with.
+struct View<'a> {
+    lens: Lens<'a>,
+    volume: &'a ShadedVolume,
     node_from_world: DAffine3,
     /// The eye in node space.
     origin: DVec3,
     /// World length between samples.
     ds: f64,
-    settings: &'a MarchSettings,
 }
 
-impl View<'_> {
+impl Lens<'_> {
     /// Unit directions of the rays through a rectangle of the image: its top left corner and its sides, in pixels.
     fn rays(&self, [x, y]: [f64; 2], [across, down]: [f64; 2]) -> impl Iterator<Item = DVec3> {
         let side = self.settings.samples;
@@ -192,31 +202,48 @@ impl View<'_> {
         Pixel { radiance: mean(sum.radiance), transmittance: mean(sum.transmittance), depth: sum.depth }
     }
 
-    /// The pixels of row `y` in some columns.
-    pub(crate) fn row(&self, y: usize, columns: &[usize]) -> Vec<Pixel> {
-        let corner = |x: usize| [x as f64, y as f64];
-        let directions: Vec<DVec3> = columns.iter().flat_map(|&x| self.rays(corner(x), [1.0; 2])).collect();
-        let marched = march_rays(self, &directions);
-        let count = self.settings.samples * self.settings.samples;
-        let pixel = |(marched, directions): (&[Pixel], &[DVec3])| {
-            let rays = marched.iter().zip(directions);
-            self.mean(rays.map(|(ray, direction)| before(*ray, self.medium, self.backdrop, *direction)))
-        };
-        marched.chunks(count).zip(directions.chunks(count)).map(pixel).collect()
-    }
-
-    /// What the medium alone leaves in rectangles of one size with these top left corners.
-    pub(crate) fn medium_alone(&self, corners: impl Iterator<Item = [f64; 2]>, size: [f64; 2]) -> Vec<Pixel> {
-        let directions: Vec<DVec3> = corners.flat_map(|corner| self.rays(corner, size)).collect();
-        let marched = march_rays(self, &directions);
-        let count = self.settings.samples * self.settings.samples;
-        marched.chunks(count).map(|rays| self.mean(rays.iter().copied())).collect()
-    }
-
     /// Pixel (`x`, `y`), of which the medium alone leaves `marched`.
     pub(crate) fn in_front(&self, marched: Pixel, x: usize, y: usize) -> Pixel {
         let rays = self.rays([x as f64, y as f64], [1.0; 2]);
         self.mean(rays.map(|direction| before(marched, self.medium, self.backdrop, direction)))
+    }
+}
+
+impl View<'_> {
+    /// The pixels of row `y` in some columns.
+    fn row(&self, y: usize, columns: &[usize]) -> Vec<Pixel> {
+        let lens = self.lens;
+        let corner = |x: usize| [x as f64, y as f64];
+        let directions: Vec<DVec3> = columns.iter().flat_map(|&x| lens.rays(corner(x), [1.0; 2])).collect();
+        let marched = march_rays(self, &directions);
+        let count = lens.settings.samples * lens.settings.samples;
+        let pixel = |(marched, directions): (&[Pixel], &[DVec3])| {
+            let rays = marched.iter().zip(directions);
+            lens.mean(rays.map(|(ray, direction)| before(*ray, lens.medium, lens.backdrop, *direction)))
+        };
+        marched.chunks(count).zip(directions.chunks(count)).map(pixel).collect()
+    }
+
+    /// Some pixels, by column and row, row by row.
+    fn pixels(&self, some: &[[usize; 2]]) -> Vec<Pixel> {
+        let rows: Vec<&[[usize; 2]]> = some.chunk_by(|a, b| a[1] == b[1]).collect();
+        let row = |row: &[[usize; 2]]| self.row(row[0][1], &row.iter().map(|at| at[0]).collect::<Vec<_>>());
+        rows.into_par_iter().flat_map_iter(row).collect()
+    }
+
+    /// What the medium alone leaves in rectangles that divide the image into so many columns and rows.
+    fn medium_alone(&self, [width, height]: [usize; 2]) -> Film {
+        let (lens, camera) = (self.lens, self.lens.camera);
+        let size = [camera.width as f64 / width as f64, camera.height as f64 / height as f64];
+        let count = lens.settings.samples * lens.settings.samples;
+        let mut film = Film::new(width, height);
+        film.pixels.par_chunks_mut(width).enumerate().for_each(|(j, row)| {
+            let corners = (0..width).map(|i| [i as f64 * size[0], j as f64 * size[1]]);
+            let directions: Vec<DVec3> = corners.flat_map(|corner| lens.rays(corner, size)).collect();
+            let marched = march_rays(self, &directions);
+            row.iter_mut().zip(marched.chunks(count)).for_each(|(out, rays)| *out = lens.mean(rays.iter().copied()));
+        });
+        film
     }
 }
 
@@ -226,9 +253,9 @@ fn march_rays(view: &View, directions: &[DVec3]) -> Vec<Pixel> {
     let mut out = Vec::with_capacity(directions.len());
     for world in directions {
         let direction = view.node_from_world.transform_vector3(*world);
-        let depth_per_distance = world.dot(view.camera.forward);
+        let depth_per_distance = world.dot(view.lens.camera.forward);
         let ray = Ray { origin: view.origin, direction, ds: view.ds, depth_per_distance };
-        out.push(march_ray(view.volume, &ray, view.medium.sigma_t, view.settings.cutoff));
+        out.push(march_ray(view.volume, &ray, view.lens.medium.sigma_t, view.lens.settings.cutoff));
     }
     out
 }

@@ -30,8 +30,9 @@ struct March {
     bricks_a_page: u32,
     environments: u32,
     has_peak: u32,
-    // Tangent of a pixel, world distance between samples, distance of the plane along the axis.
-    pixel: f32,
+    // Tangents of a pixel across and down.
+    pixel: vec2<f32>,
+    // World distance between samples, distance of the plane along the axis.
     ds: f32,
     plane: f32,
     // That distance in samples: its fraction; and the least k, that of the eye.
@@ -39,7 +40,11 @@ struct March {
     plane_samples: f32,
     least: i32,
     cutoff: f32,
-    pad: f32,
+    // 1 where each thread's place in the film holds the column and the row of its pixel.
+    listed: u32,
+    pad_0: f32,
+    pad_1: f32,
+    pad_2: f32,
 }
 
 struct Pixel {
@@ -239,7 +244,9 @@ fn march_pixels(
     let thread = thread_number(group, groups, local);
     if thread >= march.pixels { return; }
     let at = march.first_pixel + thread;
-    let corner = vec2(f32(at % march.size.x), f32(at / march.size.x)) - 0.5 * vec2<f32>(march.size);
+    var place = vec2(f32(at % march.size.x), f32(at / march.size.x));
+    if march.listed != 0u { place = film[thread].radiance.xy; }
+    let corner = place - 0.5 * vec2<f32>(march.size);
     var sum = Pixel(vec4(0.0, 0.0, 0.0, FAR), vec4(0.0));
     for (var ray = 0u; ray < march.samples * march.samples; ray++) {
         let part = (vec2(f32(ray % march.samples), f32(ray / march.samples)) + 0.5) / f32(march.samples);

@@ -8,6 +8,8 @@
 use crate::backdrop::Sky;
 use crate::camera::Camera;
 use crate::film::Film;
+#[cfg(feature = "gpu")]
+use crate::gpu::grid_solve::GridProblem;
 use crate::light::{Beam, Light, beams};
 use crate::march::{MarchMedium, MarchSettings, march};
 use crate::medium::field::DensityField;
@@ -17,10 +19,11 @@ use crate::transport::compensated::centres::incident::incident;
 use crate::transport::compensated::centres::route::{CentreError, CentreSettings, CentreTransport, MultipleScattering};
 use crate::transport::compensated::centres::source::{CentreSource, UnitPlacement};
 use crate::transport::compensated::grid::route::{GridSettings, GridTransport};
-use crate::transport::medium::{MediumError, MediumParameters};
+use crate::transport::medium::{BandedMedium, MediumError, MediumParameters};
 use crate::transport::transfer::source::{TransferError, TransferSettings, TransferTransport};
 use crate::transport::{ScatteringOrder, SourceRadiance};
 use glam::DVec3;
+use std::sync::Arc;
 use std::time::Instant;
 
 /// Where the source radiance is solved.
@@ -160,7 +163,7 @@ pub struct Renderer {
     lights: Vec<Light>,
     /// The lights as beams, for the grid route.
     beams: Option<Vec<Beam>>,
-    sky: Option<Sky>,
+    sky: Option<Arc<Sky>>,
     loaded: Option<Loaded>,
     source: Option<(Box<dyn SourceRadiance>, MarchMedium)>,
     /// The eye that the frame's volume is shaded for.
@@ -242,9 +245,20 @@ impl Renderer {
         }
         seconds.volume_pass = start.elapsed().as_secs_f64();
         let start = Instant::now();
-        let film = march(volume, camera, lit.medium, lit.sky, lit.march);
+        let film = march(volume, camera, lit.medium, &**lit.sky, lit.march);
         seconds.view_pass = start.elapsed().as_secs_f64();
         Ok((film, seconds))
+    }
+
+    /// What the grid route is to solve, and what its passes need, for the device. None before any frame, and for other routes.
+    #[cfg(feature = "gpu")]
+    pub(crate) fn unlit(&mut self) -> Option<Unlit<'_>> {
+        let (Some(loaded), Route::Grid(settings)) = (&self.loaded, self.settings.route) else { return None };
+        let beams = self.beams.get_or_insert_with(|| beams(&self.lights, settings.beams)).as_slice();
+        let (banded, medium) = grid_medium(&self.medium, &self.settings);
+        let sky = sky(&mut self.sky, &self.lights, &medium, (self.medium.g, self.settings.sh_order));
+        let (field, scattering) = (&loaded.frame.field, self.settings.scattering);
+        Some(Unlit { problem: GridProblem { field, beams, medium: banded, scattering, settings }, medium, sky })
     }
 
     /// Solves for the source radiance, if an edit has dropped it. None before any frame.
@@ -258,12 +272,19 @@ impl Renderer {
             self.source = Some(solve(loaded, &self.settings, &self.medium, &self.lights, beams)?);
         }
         let Some((source, medium)) = &self.source else { return Ok(None) };
-        let peak = (medium.peak_ratio != [1.0; 3]).then_some((self.medium.g, self.settings.sh_order));
-        let sky = self.sky.get_or_insert_with(|| Sky::new(&self.lights, peak));
+        let sky = sky(&mut self.sky, &self.lights, medium, (self.medium.g, self.settings.sh_order));
         let (field, volume, march) = (&loaded.frame.field, &mut loaded.volume, &self.settings.march);
         let shaded = &mut self.shaded;
         Ok(Some(Lit { field, volume, shaded, source: source.as_ref(), medium, sky, march }))
     }
+}
+
+/// A frame before it is lit.
+#[cfg(feature = "gpu")]
+pub(crate) struct Unlit<'a> {
+    pub(crate) problem: GridProblem<'a>,
+    pub(crate) medium: MarchMedium,
+    pub(crate) sky: &'a Arc<Sky>,
 }
 
 /// A frame under its lights: what the passes after the solution need.
@@ -274,8 +295,23 @@ pub(crate) struct Lit<'a> {
     pub(crate) shaded: &'a mut Option<DVec3>,
     pub(crate) source: &'a dyn SourceRadiance,
     pub(crate) medium: &'a MarchMedium,
-    pub(crate) sky: &'a Sky,
+    pub(crate) sky: &'a Arc<Sky>,
     pub(crate) march: &'a MarchSettings,
+}
+
+/// The medium that the grid route solves for, and the one that is marched with it.
+fn grid_medium(medium: &MediumParameters, settings: &RenderSettings) -> (BandedMedium, MarchMedium) {
+    let banded = match settings.scattering {
+        ScatteringOrder::Single => medium.windowed(settings.sh_order),
+        ScatteringOrder::All => medium.banded(settings.sh_order),
+    };
+    (banded, MarchMedium::of(medium.sigma_t, banded.sigma_t))
+}
+
+/// The sky behind the medium, made if it is not there; `peak` is its forward peak, if the march takes one out.
+fn sky<'a>(sky: &'a mut Option<Arc<Sky>>, lights: &[Light], medium: &MarchMedium, peak: (f32, usize)) -> &'a Arc<Sky> {
+    let peak = (medium.peak_ratio != [1.0; 3]).then_some(peak);
+    sky.get_or_insert_with(|| Arc::new(Sky::new(lights, peak)))
 }
 
 fn solve(
@@ -288,12 +324,9 @@ fn solve(
     let Loaded { frame, transport, .. } = loaded;
     Ok(match transport {
         Transport::Grid(transport) => {
-            let banded = match settings.scattering {
-                ScatteringOrder::Single => medium.windowed(settings.sh_order),
-                ScatteringOrder::All => medium.banded(settings.sh_order),
-            };
+            let (banded, marched) = grid_medium(medium, settings);
             let source = transport.solve(&frame.field, beams, &banded, settings.scattering);
-            (Box::new(source), MarchMedium::of(medium.sigma_t, banded.sigma_t))
+            (Box::new(source), marched)
         }
         Transport::Centres(transport, placement) => {
             let light = incident(lights, transport.directions(), transport.rings(), placement.rotation);

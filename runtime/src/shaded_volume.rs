@@ -61,10 +61,16 @@ impl BrickTable {
         Self { bricks, dense, places }
     }
 
-    /// The first node of each brick with density.
-    pub(crate) fn corners(&self) -> impl Iterator<Item = [usize; 3]> {
+    /// Boxes that all nodes of bricks with density lie in: the first node of each run of bricks along x, and how many
+    /// nodes it is from there to the last along x, y and z.
+    pub(crate) fn runs(&self) -> impl Iterator<Item = ([usize; 3], [usize; 3])> {
         let [bx, by, _] = self.bricks;
-        self.dense.iter().map(move |&b| b as usize).map(move |b| [b % bx, b / bx % by, b / bx / by].map(|b| b * BRICK))
+        let next_to = move |a: &u32, b: &u32| a + 1 == *b && !(*b as usize).is_multiple_of(bx);
+        self.dense.chunk_by(next_to).map(move |run| {
+            let first = run[0] as usize;
+            let corner = [first % bx, first / bx % by, first / bx / by].map(|b| b * BRICK);
+            (corner, [run.len() * BRICK, BRICK, BRICK])
+        })
     }
 }
 
@@ -94,11 +100,6 @@ impl ShadedVolume {
         let nodes = table.dense.par_iter().map(black).collect();
         let density_max = field.values.par_iter().copied().reduce(|| 0.0, f32::max);
         Self { dims: field.dims, nodes, table, world_from_node: field.world_from_node, density_max }
-    }
-
-    /// The first node of each brick, and how many nodes it is to the last along a side.
-    pub(crate) fn corners(&self) -> (impl Iterator<Item = [usize; 3]>, usize) {
-        (self.table.corners(), BRICK)
     }
 
     /// Writes the radiance of all nodes anew: `row(j, k, out)` gives that of the nodes `[.., j, k]` in the first three

@@ -130,7 +130,7 @@ pub struct RenderArgs {
     /// How the images are made.
     #[arg(long, value_enum, default_value_t)]
     pub method: MethodChoice,
-    /// What marches the rays: cpu, gpu for the best graphics device, or part of the name of one that `devices` lists.
+    /// What lights and marches: cpu, gpu for the best graphics device, or part of the name of one that `devices` lists.
     #[arg(long, value_name = "DEVICE", default_value = "cpu")]
     pub device: String,
     /// Error to meet, such as 5%: relative RMSE over the pixels with smoke (method auto).

@@ -23,7 +23,7 @@ pub struct ViewArgs {
     /// How the pictures are made; auto is the fast method, or the reference where a light needs it.
     #[arg(long, value_enum, default_value_t)]
     pub method: MethodChoice,
-    /// What marches the rays: cpu, gpu for the best graphics device, or part of the name of one that `devices` lists.
+    /// What lights and marches: cpu, gpu for the best graphics device, or part of the name of one that `devices` lists.
     #[arg(long, value_name = "DEVICE", default_value = "cpu")]
     pub device: String,
     /// Folder that key S saves to [default: the working directory].

@@ -7,14 +7,13 @@
 use super::at_rest::{decode_gaussians, encode_rank};
 use super::gaussians::{self, GAUSSIAN_BYTES};
 use super::records::{self, Codec, FrameRecord, ResidualKind};
+use super::work_file;
 use super::zlib::deflate;
-use crate::bounded::Bytes;
 use crate::gaussian::Gaussian;
 use crate::residual::ResidualCodes;
 use crate::residual::rank::{self, RankView};
 use crate::{Error, Result};
 use std::path::Path;
-use xxhash_rust::xxh3::xxh3_64;
 
 const MAGIC: [u8; 8] = *b"SBWORK\x01\n";
 
@@ -120,37 +119,15 @@ impl EncodedFrame {
             "frame",
             &(self.record, [self.at_rest.gaussians as u32, self.at_rest.residual as u32]),
         )?;
-        let mut bytes = MAGIC.to_vec();
-        let parts = [&record, &self.gaussians, &self.residual, &self.ranks];
-        for part in parts {
-            bytes.extend((part.len() as u64).to_le_bytes());
-        }
-        parts.iter().for_each(|part| bytes.extend(*part));
-        bytes.extend(xxh3_64(&bytes).to_le_bytes());
-        Ok(bytes)
+        Ok(work_file::join(MAGIC, [&record, &self.gaussians, &self.residual, &self.ranks]))
     }
 
     /// The frame of [`Self::to_bytes`]; anything else is an error.
     pub fn from_bytes(path: &Path, bytes: &[u8]) -> Result<Self> {
-        let mut head = Bytes::new(path, bytes);
-        if head.take(8, "magic")? != MAGIC {
-            return Err(head.invalid("magic", "other bytes", "a work file of this version"));
-        }
-        let sum = bytes.len().saturating_sub(8);
-        if head.remaining() < 8 || xxh3_64(&bytes[..sum]).to_le_bytes() != bytes[sum..] {
-            return Err(head.invalid("checksum", "another", "that of the bytes before it"));
-        }
-        let mut lengths = [0; 4];
-        for length in &mut lengths {
-            *length = usize::try_from(head.u64("length")?).unwrap_or(usize::MAX);
-        }
-        let record = head.take(lengths[0], "record")?;
+        let [record, gaussians, residual, ranks] =
+            work_file::split(path, MAGIC, ["record", "gaussians", "residual", "ranks"], bytes)?;
         let (record, codecs): (FrameRecord, [u32; 2]) = records::decode(path, "frame", record)?;
-        let gaussians = head.take(lengths[1], "gaussians")?.to_vec();
-        let residual = head.take(lengths[2], "residual")?.to_vec();
-        let ranks = head.take(lengths[3], "ranks")?.to_vec();
-        head.take(8, "checksum")?;
-        head.finish("end")?;
+        let [gaussians, residual, ranks] = [gaussians, residual, ranks].map(<[u8]>::to_vec);
         let codec = |number: u32| {
             Codec::from_number(number).ok_or_else(|| Error::invalid(path, "codec", number, "a codec's number"))
         };

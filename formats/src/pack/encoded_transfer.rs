@@ -9,11 +9,10 @@ use super::container::{KIND_TRANSFER_BASES, KIND_TRANSFER_ROWS};
 use super::records::{self, Codec};
 use super::transfer_layout::{decode_bases, decode_rows, encode_bases, encode_rows, from_rest, to_rest};
 use super::transfer_record::TransferFrameRecord;
-use crate::bounded::Bytes;
+use super::work_file;
 use crate::transfer::{Shape, TransferBases, TransferRows};
 use crate::{Error, Result};
 use std::path::Path;
-use xxhash_rust::xxh3::xxh3_64;
 
 const MAGIC: [u8; 8] = *b"SBTRANS\n";
 
@@ -96,35 +95,17 @@ impl EncodedTransfer {
         let bases = self.bases.as_ref().map(|bases| (bases.codec as u32, bases.bytes_resident));
         let record = records::encode(path, "transfer", &(self.record, rows, bases))?;
         let bases = self.bases.as_ref().map_or(&[][..], |bases| &bases.bytes);
-        let parts = [&record[..], &self.rows.bytes, bases];
-        let mut bytes = MAGIC.to_vec();
-        parts.iter().for_each(|part| bytes.extend((part.len() as u64).to_le_bytes()));
-        parts.iter().for_each(|part| bytes.extend(*part));
-        bytes.extend(xxh3_64(&bytes).to_le_bytes());
-        Ok(bytes)
+        Ok(work_file::join(MAGIC, [&record, &self.rows.bytes, bases]))
     }
 
     /// The transfer of [`Self::to_bytes`], all of it checked; anything else is an error.
     pub fn from_bytes(path: &Path, bytes: &[u8]) -> Result<Self> {
-        let mut head = Bytes::new(path, bytes);
-        if head.take(8, "magic")? != MAGIC {
-            return Err(head.invalid("magic", "other bytes", "a work file of transfer of this version"));
-        }
-        let sum = bytes.len().saturating_sub(8);
-        if head.remaining() < 8 || xxh3_64(&bytes[..sum]).to_le_bytes() != bytes[sum..] {
-            return Err(head.invalid("checksum", "another", "that of the bytes before it"));
-        }
-        let mut lengths = [0; 3];
-        for length in &mut lengths {
-            *length = usize::try_from(head.u64("length")?).unwrap_or(usize::MAX);
-        }
+        let [record, rows_bytes, bases_bytes] =
+            work_file::split(path, MAGIC, ["record", "transfer.rows", "transfer.bases"], bytes)?;
         type Head = (u32, u64);
         let (record, rows, bases): (TransferFrameRecord, Head, Option<Head>) =
-            records::decode(path, "transfer", head.take(lengths[0], "record")?)?;
-        let rows_bytes = head.take(lengths[1], "transfer.rows")?.to_vec();
-        let bases_bytes = head.take(lengths[2], "transfer.bases")?.to_vec();
-        head.take(8, "checksum")?;
-        head.finish("end")?;
+            records::decode(path, "transfer", record)?;
+        let [rows_bytes, bases_bytes] = [rows_bytes, bases_bytes].map(<[u8]>::to_vec);
         let rows = section(path, "transfer.rows", rows, rows_bytes, |what, resident| {
             decode_rows(path, what, resident)?.check(path, what)
         })?;
@@ -133,7 +114,7 @@ impl EncodedTransfer {
                 decode_bases(path, what, resident)?.check(path, what)
             })?),
             None if bases_bytes.is_empty() => None,
-            None => return Err(head.invalid("transfer.bases", format!("{} bytes", bases_bytes.len()), "none")),
+            None => return Err(Error::invalid(path, "transfer.bases", format!("{} bytes", bases_bytes.len()), "none")),
         };
         let encoded = Self { record, rows, bases };
         encoded.check(path)?;
@@ -215,6 +196,7 @@ mod tests {
 
     #[test]
     fn malicious_work_files_with_good_checksums_never_panic() {
+        use xxhash_rust::xxh3::xxh3_64;
         let path = Path::new("p");
         let (bases, rows) = some_transfer(9, 2, 1);
         let record = TransferFrameRecord { voxels: 9, cells: 2, ..Default::default() };

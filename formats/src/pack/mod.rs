@@ -28,6 +28,7 @@ mod transfer_reader;
 pub mod transfer_record;
 mod transfer_sections;
 mod validate;
+mod work_file;
 pub mod writer;
 mod zlib;
 

@@ -64,8 +64,8 @@ layout! {
         environments: u32,
         /// 1 where a forward peak counts as not scattered.
         has_peak: u32,
-        /// Tangent of a pixel.
-        pixel: f32,
+        /// Tangents of a pixel, across and down.
+        pixel: [f32; 2],
         /// World length between samples.
         ds: f32,
         /// Distance of the plane along the axis, world length.
@@ -78,8 +78,14 @@ layout! {
         least: i32,
         /// Transmittance at which a ray ends.
         cutoff: f32,
+        /// 1 where the film lists its pixels.
+        listed: u32,
         /// Nothing.
-        pad: f32,
+        pad_0: f32,
+        /// Nothing.
+        pad_1: f32,
+        /// Nothing.
+        pad_2: f32,
     }
 }
 
@@ -146,6 +152,26 @@ layout! {
         page_bricks: u32,
         /// Nothing.
         pad: u32,
+    }
+}
+
+layout! {
+    /// The volume pass of the route through centres: members as `centres/volume_pass.wgsl` describes them.
+    CentreVolume {
+        /// The eye, unit space.
+        eye: [f32; 4],
+        /// Nodes of the field.
+        dims: [u32; 4],
+        /// Bricks along each axis.
+        bricks: [u32; 4],
+        /// First brick of the page.
+        first_brick: u32,
+        /// Bricks of the page.
+        page_bricks: u32,
+        /// Gaussians.
+        count: u32,
+        /// Bands of what they send.
+        bands: u32,
     }
 }
 
@@ -297,36 +323,188 @@ layout! {
     }
 }
 
+layout! {
+    /// A way through a grid: members as `columns.wgsl` describes them.
+    Path {
+        /// Nodes along a row.
+        columns: u32,
+        /// Rows of a slice.
+        rows: u32,
+        /// Slices.
+        slices: u32,
+        /// Dominant axis.
+        axis: u32,
+        /// Columns of the array of rays.
+        extent_columns: u32,
+        /// Its rows.
+        extent_rows: u32,
+        /// 1 where the last slice is met first.
+        reversed: u32,
+        /// World length between slices.
+        length: f32,
+        /// Values from slice to slice.
+        slice_stride: u32,
+        /// Values from row to row.
+        row_stride: u32,
+        /// Where the density of the axis's layout starts.
+        density_start: u32,
+        /// Its first shift.
+        first_shift: u32,
+    }
+}
+
+layout! {
+    /// Where rays lie on a slice: members as `columns.wgsl` describes them.
+    Shift {
+        /// The ray just below node 0.
+        base: [u32; 2],
+        /// By how much the next one lies beyond node 0.
+        fraction: [f32; 2],
+    }
+}
+
+layout! {
+    /// Single scattering: members as `single.wgsl` describes them.
+    Single {
+        /// Nodes of the grid.
+        dims: [u32; 4],
+        /// Beams of the dispatch.
+        directions: u32,
+        /// The first of them.
+        first_direction: u32,
+        /// Rays of the widest.
+        most_rays: u32,
+        /// Values that a beam's rays leave.
+        carried_stride: u32,
+        /// Nodes near density.
+        near: u32,
+        /// Which channel.
+        channel: u32,
+        /// 1 or 3.
+        channels: u32,
+        /// Its extinction.
+        sigma_t: f32,
+        /// The first of 16 coefficients.
+        first_coefficient: u32,
+        /// Vectors of weights a beam and channel.
+        quads: u32,
+        /// First plane of the buffer.
+        first_plane: u32,
+        /// Planes of the buffer.
+        planes: u32,
+        /// Values of a plane.
+        plane_stride: u32,
+        /// 1 where planes hold the nodes near density alone.
+        compact: u32,
+        /// 1 for the first beams.
+        starts: u32,
+        /// Nothing.
+        pad: u32,
+    }
+}
+
+layout! {
+    /// Multiple scattering: members as `scatter.wgsl` describes them.
+    Scatter {
+        /// Nodes of the grid.
+        dims: [u32; 4],
+        /// Ordinates of the dispatch.
+        directions: u32,
+        /// The first of them.
+        first_direction: u32,
+        /// Rays of the widest.
+        most_rays: u32,
+        /// Rays of all slices of an ordinate.
+        carried_stride: u32,
+        /// Nodes near density.
+        near: u32,
+        /// All nodes.
+        nodes: u32,
+        /// Which channel.
+        channel: u32,
+        /// 1 or 3.
+        channels: u32,
+        /// Its extinction.
+        sigma_t: f32,
+        /// The first of 16 coefficients.
+        first_coefficient: u32,
+        /// All coefficients.
+        coefficients: u32,
+        /// Vectors of them an ordinate and channel.
+        quads: u32,
+        /// First plane of the buffer.
+        first_plane: u32,
+        /// Planes of the buffer.
+        planes: u32,
+        /// 1 for the first part of a sum.
+        starts: u32,
+        /// Values before the plane that is spread.
+        target_start: u32,
+    }
+}
+
+layout! {
+    /// Vectors of GMRES: members as `gmres.wgsl` describes them.
+    Gmres {
+        /// Entries, or blocks.
+        length: u32,
+        /// Which of the sums.
+        slot: u32,
+        /// Block of the first entry.
+        first_block: u32,
+        /// What the factor is multiplied by.
+        kind: u32,
+        /// Factor of the vector itself.
+        own: f32,
+        /// Factor of the other.
+        factor: f32,
+        /// Nothing.
+        pad_0: u32,
+        /// Nothing.
+        pad_1: u32,
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::gpu::pass::PRELUDE;
-    use crate::gpu::{decode, march, transfer, volume_pass};
+    use crate::gpu::{centres, decode, gmres, march, scatter, single, transfer, volume_pass};
     use naga::TypeInner;
 
-    const SHADERS: [(&str, &str); 8] = [
+    const SHADERS: [(&str, &str); 12] = [
         ("march.wgsl", march::SHADER),
         ("route.wgsl", volume_pass::SHADER),
+        ("centres/volume_pass.wgsl", centres::SHADER),
         ("product.wgsl", transfer::PRODUCT),
         ("view_directions.wgsl", transfer::VIEW_DIRECTIONS),
         ("cells.wgsl", transfer::CELLS),
         ("source.wgsl", transfer::SOURCE),
         ("gaussian_sum.wgsl", decode::GAUSSIAN_SUM),
         ("decoder.wgsl", decode::DECODER),
+        ("single.wgsl", single::SHADER),
+        ("scatter.wgsl", scatter::SHADER),
+        ("gmres.wgsl", gmres::SHADER),
     ];
     type Members = &'static [(&'static str, usize, usize)];
     /// Every structure of every shader.
-    const LAYOUTS: [(&str, usize, Members); 10] = [
+    const LAYOUTS: [(&str, usize, Members); 16] = [
         ("March", size_of::<March>(), March::MEMBERS),
         ("Pixel", size_of::<Pixel>(), Pixel::MEMBERS),
         ("Environment", size_of::<Environment>(), Environment::MEMBERS),
         ("VolumePass", size_of::<VolumePass>(), VolumePass::MEMBERS),
+        ("CentreVolume", size_of::<CentreVolume>(), CentreVolume::MEMBERS),
         ("Product", size_of::<Product>(), Product::MEMBERS),
         ("ViewDirections", size_of::<ViewDirections>(), ViewDirections::MEMBERS),
         ("Cells", size_of::<Cells>(), Cells::MEMBERS),
         ("Transfer", size_of::<Transfer>(), Transfer::MEMBERS),
         ("GaussianSum", size_of::<GaussianSum>(), GaussianSum::MEMBERS),
         ("Decoder", size_of::<Decoder>(), Decoder::MEMBERS),
+        ("Path", size_of::<Path>(), Path::MEMBERS),
+        ("Shift", size_of::<Shift>(), Shift::MEMBERS),
+        ("Single", size_of::<Single>(), Single::MEMBERS),
+        ("Scatter", size_of::<Scatter>(), Scatter::MEMBERS),
+        ("Gmres", size_of::<Gmres>(), Gmres::MEMBERS),
     ];
 
     fn parse(name: &str, text: &str) -> naga::Module {
@@ -334,11 +512,11 @@ mod tests {
         naga::front::wgsl::parse_str(&text).unwrap_or_else(|e| panic!("{name}: {}", e.emit_to_string(&text)))
     }
 
-    /// The first structure that differs from its twin, and how many were compared.
-    fn compare(module: &naga::Module) -> Result<usize, String> {
+    /// The first structure that differs from its twin, or the names of those that were compared.
+    fn compare(module: &naga::Module) -> Result<Vec<String>, String> {
         let mut layouter = naga::proc::Layouter::default();
         layouter.update(module.to_ctx()).map_err(|e| e.to_string())?;
-        let mut compared = 0;
+        let mut compared = Vec::new();
         for (_, kind) in module.types.iter() {
             let (TypeInner::Struct { members, span }, Some(name)) = (&kind.inner, &kind.name) else { continue };
             let Some((_, size, ours)) = LAYOUTS.iter().find(|(n, ..)| n == name) else {
@@ -351,22 +529,24 @@ mod tests {
             if *span as usize != *size || theirs != *ours {
                 return Err(format!("{name}: {span} {theirs:?}, expected {size} {ours:?}"));
             }
-            compared += 1;
+            compared.push(name.clone());
         }
         Ok(compared)
     }
 
     #[test]
     fn every_structure_has_the_same_size_and_offsets_on_both_sides() {
-        let compared: usize = SHADERS.iter().map(|(name, text)| compare(&parse(name, text)).unwrap()).sum();
-        assert_eq!(compared, LAYOUTS.len());
+        let compared = SHADERS.iter().flat_map(|(name, text)| compare(&parse(name, text)).unwrap());
+        // Two shaders may share one.
+        let compared: std::collections::BTreeSet<String> = compared.collect();
+        assert_eq!(compared.len(), LAYOUTS.len());
     }
 
     #[test]
     fn a_member_that_is_moved_renamed_or_missing_is_found() {
         for (from, to) in [
             ("    least: i32,\n    cutoff: f32,", "    cutoff: f32,\n    least: i32,"),
-            ("    pixel: f32,", "    texel: f32,"),
+            ("    pixel: vec2<f32>,", "    texel: vec2<f32>,"),
             ("    peak_ratio: vec4<f32>,", ""),
             ("    up_is_y: u32,", "    up_is_y: vec2<u32>,"),
         ] {

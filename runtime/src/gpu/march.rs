@@ -1,8 +1,8 @@
 //! The host's side of the view pass, `march.wgsl`: a film from a volume on the device.
 //!
 //! What differs from the processor: places are f32 (see the shader), azimuths of environments are as exact as the
-//! device's `atan2` (Vulkan allows 4,096 units in the last place, 2e-4 of a turn), and only whole resolution is served.
-//! Pixels are done in runs of at most 2^20 rays, so that no submission takes so long that a driver gives up on it.
+//! device's `atan2` (Vulkan allows 4,096 units in the last place, 2e-4 of a turn). At half resolution the processor reads
+//! the pixels between the coarse ones, and the device marches those that need rays of their own. Pixels are done in runs of at most 2^20 rays, so that no submission takes so long that a driver gives up on it.
 
 use super::device::{Gpu, GpuError};
 use super::layouts::{Environment, March, Pixel as DevicePixel};
@@ -11,8 +11,10 @@ use super::volume::DeviceVolume;
 use crate::backdrop::Sky;
 use crate::camera::Camera;
 use crate::film::{Film, Pixel};
-use crate::march::{MarchMedium, MarchSettings, sample_distance};
+use crate::half_resolution;
+use crate::march::{Lens, MarchMedium, MarchSettings, sample_distance};
 use glam::DVec3;
+use std::sync::Arc;
 
 /// The shader, without its prelude.
 pub const SHADER: &str = include_str!("../march.wgsl");
@@ -28,6 +30,7 @@ pub struct MarchPass {
 
 /// A [`Sky`] on the device.
 pub struct DeviceSky {
+    sky: Arc<Sky>,
     count: u32,
     has_peak: bool,
     environments: wgpu::Buffer,
@@ -36,7 +39,7 @@ pub struct DeviceSky {
 
 impl DeviceSky {
     /// A copy of `sky`.
-    pub fn new(gpu: &Gpu, sky: &Sky) -> Result<Self, GpuError> {
+    pub fn new(gpu: &Gpu, sky: &Arc<Sky>) -> Result<Self, GpuError> {
         let four = |v: &[f32; 3]| [v[0], v[1], v[2], 0.0];
         let mut texels: Vec<[f32; 4]> = sky.peak().iter().map(four).collect();
         let mut environments = Vec::new();
@@ -52,6 +55,7 @@ impl DeviceSky {
         }
         gpu.checked("backdrop", || {
             Ok(Self {
+                sky: sky.clone(),
                 count: environments.len() as u32,
                 has_peak: !sky.peak().is_empty(),
                 environments: gpu.upload("visible environments", &environments)?,
@@ -82,14 +86,61 @@ impl MarchPass {
         sky: &DeviceSky,
         settings: &MarchSettings,
     ) -> Result<(Film, Option<f64>), GpuError> {
-        let mut film = Film::new(camera.width, camera.height);
+        let uniform = placed(volume, camera, [camera.width, camera.height], medium, sky, settings);
+        if !settings.half_resolution {
+            let mut film = Film::new(camera.width, camera.height);
+            let took = self.run(gpu, volume, sky, &uniform, None, &mut film.pixels)?;
+            return Ok((film, took));
+        }
+        let size = half_resolution::coarse_size(camera);
+        let mut coarse = Film::new(size[0], size[1]);
+        // The medium alone: nothing behind it, and no peak.
+        let alone = March {
+            peak_ratio: [1.0; 4],
+            environments: 0,
+            has_peak: 0,
+            ..placed(volume, camera, size, medium, sky, settings)
+        };
+        let mut microseconds = self.run(gpu, volume, sky, &alone, None, &mut coarse.pixels)?;
+        let lens = Lens { camera, medium, backdrop: &*sky.sky, settings };
+        let film = half_resolution::film(&lens, &coarse, |apart| {
+            let mut pixels = vec![Pixel::EMPTY; apart.len()];
+            let took = self.run(gpu, volume, sky, &uniform, Some(apart), &mut pixels)?;
+            microseconds = microseconds.zip(took).map(|(sum, took)| sum + took);
+            Ok(pixels)
+        })?;
+        Ok((film, microseconds))
+    }
+
+    /// Marches the pixels of the film that `all` describes, or those `listed` by column and row.
+    fn run(
+        &self,
+        gpu: &Gpu,
+        volume: &DeviceVolume,
+        sky: &DeviceSky,
+        all: &March,
+        listed: Option<&[[usize; 2]]>,
+        pixels: &mut [Pixel],
+    ) -> Result<Option<f64>, GpuError> {
         let most = (gpu.summary().storage_binding.min(gpu.summary().buffer) as usize / size_of::<DevicePixel>()).max(1);
-        let run = (RAYS / (settings.samples * settings.samples)).clamp(1, most).min(film.pixels.len().max(1));
+        let run = (RAYS / (all.samples * all.samples) as usize).clamp(1, most).min(pixels.len().max(1));
         let out = gpu.storage("pixels of the image", (run * size_of::<DevicePixel>()) as u64)?;
-        let all = placed(volume, camera, medium, sky, settings);
         let mut microseconds = Some(0.0);
-        for (number, pixels) in film.pixels.chunks_mut(run).enumerate() {
-            let uniform = March { first_pixel: (number * run) as u32, pixels: pixels.len() as u32, ..all };
+        for (number, pixels) in pixels.chunks_mut(run).enumerate() {
+            if let Some(listed) = listed {
+                let place = |&[x, y]: &[usize; 2]| DevicePixel {
+                    radiance: [x as f32, y as f32, 0.0, 0.0],
+                    ..DevicePixel::default()
+                };
+                let places: Vec<DevicePixel> = listed[number * run..][..pixels.len()].iter().map(place).collect();
+                gpu.queue.write_buffer(&out, 0, bytemuck::cast_slice(&places));
+            }
+            let uniform = March {
+                first_pixel: (number * run) as u32,
+                pixels: pixels.len() as u32,
+                listed: listed.is_some().into(),
+                ..*all
+            };
             let uniform = gpu.uniform("march", &uniform);
             let [a, b, c, d] = [0, 1, 2, 3].map(|page| &volume.pages[page]);
             let inputs = [&uniform, &volume.places, a, b, c, d, &sky.environments, &sky.texels, &out];
@@ -105,14 +156,15 @@ impl MarchPass {
                 *pixel = Pixel { radiance: [r, g, b], transmittance: [x, y, z], depth };
             }
         }
-        Ok((film, microseconds))
+        Ok(microseconds)
     }
 }
 
-/// Everything but the pixels of a dispatch. All differences of large numbers are taken here, in f64.
+/// Everything but the pixels of a dispatch, for an image of `size` columns and rows. All differences of large numbers are taken here, in f64.
 fn placed(
     volume: &DeviceVolume,
     camera: &Camera,
+    size: [usize; 2],
     medium: &MarchMedium,
     sky: &DeviceSky,
     settings: &MarchSettings,
@@ -126,7 +178,9 @@ fn placed(
     let samples = (plane / ds).min(f64::from(1 << 30));
     let whole = samples.floor();
     let pixel = 2.0 * camera.tan_half_width / camera.width as f64;
-    let (right, down) = (camera.right * pixel, -camera.up * pixel);
+    let [across, along] =
+        [camera.width as f64 / size[0] as f64, camera.height as f64 / size[1] as f64].map(|n| n * pixel);
+    let (right, down) = (camera.right * across, -camera.up * along);
     let four = |v: DVec3| v.as_vec3().extend(0.0).to_array();
     let node = |v: DVec3| four(node_from_world.transform_vector3(v));
     let wide = |v: [f32; 3], last: f32| [v[0], v[1], v[2], last];
@@ -144,20 +198,20 @@ fn placed(
         peak_ratio: wide(medium.peak_ratio, 1.0),
         top: wide(top.map(|t| t as f32), 0.0),
         bricks: [volume.bricks[0] as u32, volume.bricks[1] as u32, volume.bricks[2] as u32, 0],
-        size: [camera.width as u32, camera.height as u32],
+        size: size.map(|n| n as u32),
         first_pixel: 0,
         pixels: 0,
         samples: settings.samples as u32,
         bricks_a_page: volume.bricks_a_page.min(u32::MAX as usize) as u32,
         environments: sky.count,
         has_peak: (sky.has_peak && medium.peak_ratio != [1.0; 3]).into(),
-        pixel: pixel as f32,
+        pixel: [across as f32, along as f32],
         ds: ds as f32,
         plane: plane as f32,
         plane_fraction: (samples - whole) as f32,
         plane_samples: samples as f32,
         least: -(whole as i32),
         cutoff: settings.cutoff,
-        pad: 0.0,
+        ..March::default()
     }
 }

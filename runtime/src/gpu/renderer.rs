@@ -1,10 +1,12 @@
-//! The calls of [`Renderer`], with transfer, the volume pass of the grid route and the view pass on a device.
+//! The calls of [`Renderer`], with the grid route, transfer and the view pass on a device.
 //!
-//! Decoding, sweeps and the iteration for multiple scattering are the processor's, and so is the volume pass of the route
-//! through centres: their results are copied. Kept until an edit makes them void: planes, clusters and their light, bricks
-//! and backdrop on the device.
+//! Decoding is the processor's, and so are the solution at centres and the projection of light onto transfer: their results
+//! are copied. Kept until an edit makes them void: grids, planes, clusters and their light, bricks and backdrop on the
+//! device. So other light costs sweeps and solve, another view the volume pass and the march.
 
+use super::centres::{CentrePass, DeviceCentres};
 use super::device::{Gpu, GpuError};
+use super::grid_solve::{DeviceGrids, GridPass};
 use super::march::{DeviceSky, MarchPass};
 use super::self_test;
 use super::transfer::{DeviceLight, DeviceTransfer, TransferPass};
@@ -13,9 +15,10 @@ use super::volume_pass::{DeviceSource, VolumePass};
 use crate::camera::Camera;
 use crate::film::Film;
 use crate::light::Light;
+use crate::march::{MarchMedium, MarchSettings};
+use crate::medium::field::DensityField;
 use crate::medium::frame::Frame;
-use crate::renderer::{Lit, RenderError, RenderSettings, Renderer, Seconds};
-use crate::shaded_volume::ShadedVolume;
+use crate::renderer::{Lit, RenderError, RenderSettings, Renderer, Seconds, Unlit};
 use crate::transport::medium::MediumParameters;
 use glam::DVec3;
 use std::sync::Arc;
@@ -38,15 +41,28 @@ struct Loaded {
     density: wgpu::Buffer,
 }
 
+impl Loaded {
+    /// Its bricks, not yet shaded, and its density.
+    fn of_field(gpu: &Gpu, field: &DensityField) -> Result<Self, GpuError> {
+        let density = gpu.upload("density of the frame", &field.values)?;
+        Ok(Self { volume: DeviceVolume::of_field(gpu, field)?, density })
+    }
+}
+
 /// See the module's head.
 pub struct GpuRenderer {
     gpu: Arc<Gpu>,
     /// Checks, solves, and keeps what is the processor's.
     solver: Renderer,
     march: MarchPass,
+    march_settings: MarchSettings,
     volume_pass: VolumePass,
     sky: Option<DeviceSky>,
+    grid_pass: GridPass,
+    grids: DeviceGrids,
     source: Option<DeviceSource>,
+    centre_pass: CentrePass,
+    centres: Option<DeviceCentres>,
     transfer_pass: TransferPass,
     transfer: Option<DeviceTransfer>,
     light: Option<DeviceLight>,
@@ -64,15 +80,29 @@ impl GpuRenderer {
         lights: Vec<Light>,
     ) -> Result<Self, GpuRenderError> {
         let solver = Renderer::new(settings, medium, lights)?;
-        if settings.march.half_resolution {
-            let name = "half resolution";
-            return Err(GpuError::Setting { name, found: "true", expected: "false" }.into());
-        }
         let (march, volume_pass) = (MarchPass::new(&gpu)?, VolumePass::new(&gpu)?);
         self_test::check(&gpu, &march)?;
         let transfer_pass = TransferPass::new(&gpu)?;
-        let (sky, source, transfer, light, loaded, eye) = (None, None, None, None, None, None);
-        Ok(Self { gpu, solver, march, volume_pass, sky, source, transfer_pass, transfer, light, loaded, eye })
+        let (grid_pass, grids) = (GridPass::new(&gpu)?, DeviceGrids::default());
+        let centre_pass = CentrePass::new(&gpu)?;
+        Ok(Self {
+            gpu,
+            solver,
+            march,
+            march_settings: settings.march,
+            volume_pass,
+            sky: None,
+            grid_pass,
+            grids,
+            source: None,
+            centre_pass,
+            centres: None,
+            transfer_pass,
+            transfer: None,
+            light: None,
+            loaded: None,
+            eye: None,
+        })
     }
 
     /// The device.
@@ -82,33 +112,86 @@ impl GpuRenderer {
 
     /// Another frame.
     pub fn set_frame(&mut self, frame: Frame) -> Result<(), RenderError> {
-        (self.source, self.transfer, self.light, self.loaded, self.eye) = (None, None, None, None, None);
+        (self.source, self.centres, self.eye) = (None, None, None);
+        (self.transfer, self.light, self.loaded) = (None, None, None);
+        self.grids = DeviceGrids::default();
         self.solver.set_frame(frame)
     }
 
     /// Other lights.
     pub fn set_lights(&mut self, lights: Vec<Light>) -> Result<(), RenderError> {
-        (self.sky, self.source, self.light, self.eye) = (None, None, None, None);
+        self.unlit();
         self.solver.set_lights(lights)
     }
 
     /// Another medium.
     pub fn set_medium(&mut self, medium: MediumParameters) -> Result<(), RenderError> {
-        (self.sky, self.source, self.light, self.eye) = (None, None, None, None);
+        self.unlit();
         self.solver.set_medium(medium)
+    }
+
+    /// Drops what depends on lights and medium.
+    fn unlit(&mut self) {
+        (self.sky, self.source, self.centres, self.light, self.eye) = (None, None, None, None, None);
     }
 
     /// The image from `camera`, and the seconds it took, copies included; empty pixels before any frame.
     pub fn render(&mut self, camera: &Camera) -> Result<(Film, Seconds), GpuRenderError> {
         let mut seconds = Seconds::default();
-        let start = Instant::now();
-        let Some(lit) = self.solver.lit()? else {
-            return Ok((Film::new(camera.width, camera.height), seconds));
+        let medium = match self.shade_grid(camera, &mut seconds)? {
+            Some(medium) => Some(medium),
+            None => self.shade(camera, &mut seconds)?,
         };
-        let Lit { field, volume: shaded, source, medium, sky, march, .. } = lit;
+        let start = Instant::now();
+        let film = match (medium, &self.loaded, &self.sky) {
+            (Some(medium), Some(loaded), Some(sky)) => {
+                self.march.film(&self.gpu, &loaded.volume, camera, &medium, sky, &self.march_settings)?.0
+            }
+            _ => Film::new(camera.width, camera.height),
+        };
+        seconds.view_pass = start.elapsed().as_secs_f64();
+        Ok((film, seconds))
+    }
+
+    /// The grid route up to its shaded volume, and the medium to march; none for other routes and before any frame.
+    fn shade_grid(&mut self, camera: &Camera, seconds: &mut Seconds) -> Result<Option<MarchMedium>, GpuRenderError> {
+        let start = Instant::now();
+        let Some(Unlit { problem, medium, sky }) = self.solver.unlit() else { return Ok(None) };
         let gpu = &*self.gpu;
-        if let (None, Some(grid)) = (&self.source, source.as_grid()) {
-            self.source = Some(DeviceSource::new(gpu, grid)?);
+        let source = match self.source.take() {
+            Some(source) => source,
+            None => self.grid_pass.solve(gpu, &mut self.grids, &problem)?,
+        };
+        let source = self.source.insert(source);
+        seconds.source_radiance = start.elapsed().as_secs_f64();
+        let start = Instant::now();
+        let eye = self.eye.take().filter(|&eye| eye == camera.position || !source.depends_on_view());
+        let loaded = match self.loaded.take() {
+            Some(loaded) => loaded,
+            None => Loaded::of_field(gpu, problem.field)?,
+        };
+        let loaded = self.loaded.insert(loaded);
+        if eye.is_none() {
+            let density = (problem.field, &loaded.density);
+            self.volume_pass.shade(gpu, source, density, &loaded.volume, camera.position)?;
+        }
+        self.eye = Some(eye.unwrap_or(camera.position));
+        if self.sky.is_none() {
+            self.sky = Some(DeviceSky::new(gpu, sky)?);
+        }
+        seconds.volume_pass = start.elapsed().as_secs_f64();
+        Ok(Some(medium))
+    }
+
+    /// The same for the other routes; none before any frame.
+    fn shade(&mut self, camera: &Camera, seconds: &mut Seconds) -> Result<Option<MarchMedium>, GpuRenderError> {
+        let start = Instant::now();
+        let Some(Lit { field, source, medium, sky, .. }) = self.solver.lit()? else {
+            return Ok(None);
+        };
+        let gpu = &*self.gpu;
+        if let (None, Some(centres)) = (&self.centres, source.as_centres()) {
+            self.centres = Some(DeviceCentres::new(gpu, centres, field)?);
         }
         let transfer = source.as_transfer();
         if let (None, Some(source)) = (&self.transfer, transfer) {
@@ -119,42 +202,26 @@ impl GpuRenderer {
         }
         seconds.source_radiance = start.elapsed().as_secs_f64();
         let start = Instant::now();
-        let on_device = self.source.is_some() || transfer.is_some();
         let eye = self.eye.take().filter(|&eye| eye == camera.position || !source.depends_on_view());
-        let loaded = match (self.loaded.take(), on_device) {
-            // A frame's bricks are the same under any light; others' volumes come whole from the processor.
-            (Some(loaded), true) => loaded,
-            (Some(loaded), false) if eye.is_some() => loaded,
-            (_, true) => Loaded {
-                volume: DeviceVolume::of_field(gpu, field)?,
-                density: gpu.upload("density of the frame", &field.values)?,
-            },
-            (_, false) => {
-                let shaded = shaded.get_or_insert_with(|| ShadedVolume::of(field));
-                source.shade(field, camera.position, shaded);
-                let density = gpu.upload::<f32>("density of the frame", &[])?;
-                Loaded { volume: DeviceVolume::of_shaded(gpu, shaded)?, density }
-            }
+        // A frame's bricks are the same under any light.
+        let loaded = match self.loaded.take() {
+            Some(loaded) => loaded,
+            None => Loaded::of_field(gpu, field)?,
         };
         let loaded = self.loaded.insert(loaded);
-        if let (None, Some(source)) = (eye, &self.source) {
-            self.volume_pass.shade(gpu, source, (field, &loaded.density), &loaded.volume, camera.position)?;
+        if let (None, Some(device), Some(centres)) = (eye, &self.centres, source.as_centres()) {
+            let eye = centres.unit_from_world(camera.position);
+            self.centre_pass.shade(gpu, device, (field, &loaded.density), &loaded.volume, eye)?;
         }
         if let (None, Some(light), Some(frame)) = (eye, &self.light, &self.transfer) {
             let density = (field, &loaded.density);
             self.transfer_pass.shade(gpu, frame, light, density, &loaded.volume, camera.position)?;
         }
         self.eye = Some(eye.unwrap_or(camera.position));
-        seconds.volume_pass = start.elapsed().as_secs_f64();
-        let start = Instant::now();
         if self.sky.is_none() {
             self.sky = Some(DeviceSky::new(gpu, sky)?);
         }
-        let film = match &self.sky {
-            Some(sky) => self.march.film(gpu, &loaded.volume, camera, medium, sky, march)?.0,
-            None => Film::new(camera.width, camera.height),
-        };
-        seconds.view_pass = start.elapsed().as_secs_f64();
-        Ok((film, seconds))
+        seconds.volume_pass = start.elapsed().as_secs_f64();
+        Ok(Some(*medium))
     }
 }

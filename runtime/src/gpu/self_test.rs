@@ -8,6 +8,7 @@ use crate::camera::Camera;
 use crate::march::{MarchMedium, MarchSettings, march};
 use crate::shaded_volume::ShadedVolume;
 use glam::{DAffine3, DVec3};
+use std::sync::Arc;
 
 /// Largest difference of radiance or transmittance, both up to about 1: some ten samples of a few roundings each are
 /// 1e-5, and a place that is off by a rounding of the box's side moves a density by as little.
@@ -26,8 +27,8 @@ pub fn check(gpu: &Gpu, pass: &MarchPass) -> Result<(), GpuError> {
     let volume = ShadedVolume::of_nodes(dims, &nodes, DAffine3::from_scale(DVec3::splat(0.25)));
     let camera = Camera::look_at(DVec3::new(-4.0, 1.5, 2.5), DVec3::new(1.0, 1.1, 1.2), DVec3::Z, 40.0, 16, 12);
     let (medium, settings) = (MarchMedium::plain([0.5, 1.0, 1.5]), MarchSettings::default());
-    let sky = Sky::new(&[], None);
-    let expected = march(&volume, &camera, &medium, &sky, &settings);
+    let sky = Arc::new(Sky::new(&[], None));
+    let expected = march(&volume, &camera, &medium, &*sky, &settings);
     let on_device = DeviceVolume::of_shaded(gpu, &volume)?;
     let (found, _) = pass.film(gpu, &on_device, &camera, &medium, &DeviceSky::new(gpu, &sky)?, &settings)?;
     let mut worst = 0.0f32;

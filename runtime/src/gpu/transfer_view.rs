@@ -10,9 +10,9 @@ use super::pass::Kernel;
 use super::transfer::{DeviceLight, DeviceTransfer, TransferPass, Work, dispatch};
 use super::volume::{DeviceVolume, PAGES};
 use crate::medium::field::DensityField;
-use crate::shaded_volume::{BRICK, BRICK_NODES};
+use crate::shaded_volume::BRICK_NODES;
 use crate::transport::transfer::view_directions::{ViewDirections, squares};
-use glam::{DVec3, Vec3};
+use glam::DVec3;
 
 impl TransferPass {
     /// Shades `volume`, which was made of `field`, for an eye in world space; microseconds where the device can tell.
@@ -58,9 +58,9 @@ impl TransferPass {
         // Directions that the smoke is seen in; none are needed where light is the same from everywhere, or black.
         let seen = (frame.g != 0.0 && light.irradiance.is_some()).then(|| {
             let along = |[i, j, k]: [usize; 3]| linear * (DVec3::new(i as f64, j as f64, k as f64) - node_eye);
-            let corners: Vec<Vec3> = volume.corners.iter().map(|&corner| along(corner).as_vec3()).collect();
+            let boxes = volume.runs.iter().map(|&(corner, sides)| (along(corner).as_vec3(), sides));
             let edges = [linear.x_axis, linear.y_axis, linear.z_axis].map(|edge| edge.as_vec3());
-            ViewDirections::of_boxes(&corners, edges, BRICK, squares(frame.g))
+            ViewDirections::of_boxes(&boxes.collect::<Vec<_>>(), edges, squares(frame.g))
         });
         let directions: Vec<[f32; 4]> =
             seen.iter().flat_map(|seen| seen.directions().iter().map(|&d| four(d))).collect();

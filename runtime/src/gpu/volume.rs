@@ -21,8 +21,8 @@ pub struct DeviceVolume {
     pub bricks: [usize; 3],
     /// Bricks with density.
     pub dense: usize,
-    /// The first node of each of them.
-    pub(crate) corners: Vec<[usize; 3]>,
+    /// Runs of them along x, see [`BrickTable::runs`].
+    pub(crate) runs: Vec<([usize; 3], [usize; 3])>,
     /// Node to world space.
     pub world_from_node: DAffine3,
     /// Largest density.
@@ -77,7 +77,7 @@ impl DeviceVolume {
                 dims,
                 bricks: table.bricks,
                 dense,
-                corners: table.corners().collect(),
+                runs: table.runs().collect(),
                 world_from_node,
                 density_max,
                 bricks_a_page,

@@ -1,10 +1,11 @@
 //! The host's side of the volume pass, `transport/compensated/grid/route.wgsl`.
 //!
-//! Planes go to the device as many at a time as a shader may see of a buffer, and stay there until the light changes.
+//! Planes stay on the device until the light changes.
 
 use super::device::{Gpu, GpuError};
 use super::layouts::VolumePass as Uniform;
 use super::pass::{Kernel, Step};
+use super::planes::{Part, Planes};
 use super::volume::{DeviceVolume, PAGES};
 use crate::medium::field::DensityField;
 use crate::shaded_volume::BRICK_NODES;
@@ -21,38 +22,56 @@ pub struct VolumePass {
     finish: Kernel,
 }
 
-/// Planes of a layer, some to a buffer.
-struct DeviceLayer {
+/// Planes of coefficients on nodes `step` voxels apart.
+pub(super) struct DeviceLayer {
     step: usize,
     dims: [usize; 3],
     bands: usize,
-    /// Number of the first plane, how many, and they.
-    parts: Vec<(usize, usize, wgpu::Buffer)>,
+    planes: Planes,
 }
 
 /// A [`GridSource`] on the device.
 pub struct DeviceSource {
     channels: usize,
-    layers: Vec<DeviceLayer>,
+    pub(super) layers: Vec<DeviceLayer>,
+    /// Products that the iteration for multiple scattering took; 0 without.
+    pub iterations: usize,
+    /// Its last relative residual.
+    pub residual: f64,
+}
+
+impl DeviceLayer {
+    /// Of planes `[coefficient * channels + channel]` of all nodes.
+    pub(super) fn new(step: usize, dims: [usize; 3], channels: usize, planes: Planes) -> Self {
+        Self { step, dims, bands: (planes.count() / channels).isqrt(), planes }
+    }
 }
 
 impl DeviceSource {
     /// A copy of `source`.
     pub fn new(gpu: &Gpu, source: &GridSource) -> Result<Self, GpuError> {
-        let limit = gpu.summary().storage_binding.min(gpu.summary().buffer);
         let layer = |(step, dims, planes): (usize, [usize; 3], &[Vec<f32>])| {
-            let bytes = 4 * dims.iter().product::<usize>() as u64;
-            let each = ((limit / bytes.max(1)) as usize).max(1);
-            let bands = (planes.len() / source.channels).isqrt();
-            let parts = planes.chunks(each).enumerate();
-            let parts = parts.map(|(part, planes)| {
-                Ok((part * each, planes.len(), gpu.upload("planes of source radiance", &planes.concat())?))
-            });
-            Ok(DeviceLayer { step, dims, bands, parts: parts.collect::<Result<_, GpuError>>()? })
+            let planes = Planes::upload(gpu, "planes of source radiance", planes, dims.iter().product())?;
+            Ok(DeviceLayer::new(step, dims, source.channels, planes))
         };
         let layers =
             gpu.checked("source radiance", || source.layers().map(layer).collect::<Result<Vec<_>, GpuError>>())?;
-        Ok(Self { channels: source.channels, layers })
+        Ok(Self { channels: source.channels, layers, iterations: source.iterations, residual: source.residual })
+    }
+
+    /// Of single scattering.
+    pub(super) fn of_layer(channels: usize, single: DeviceLayer) -> Self {
+        Self { channels, layers: vec![single], iterations: 0, residual: 0.0 }
+    }
+
+    /// True if the volume must be shaded again when the camera moves.
+    pub fn depends_on_view(&self) -> bool {
+        self.layers.iter().any(|layer| layer.bands > 1)
+    }
+
+    /// Planes of each layer, as [`GridSource::layers`] has them: for comparisons.
+    pub fn read(&self, gpu: &Gpu) -> Result<Vec<Vec<Vec<f32>>>, GpuError> {
+        self.layers.iter().map(|layer| layer.planes.read(gpu)).collect()
     }
 }
 
@@ -98,7 +117,7 @@ impl VolumePass {
             let (first_brick, bricks) = volume.page(page);
             let base = Uniform { first_brick: first_brick as u32, page_bricks: bricks as u32, ..base };
             for layer in &source.layers {
-                for (first, count, buffer) in &layer.parts {
+                for Part { first, count, buffer } in &layer.planes.parts {
                     let uniform = Uniform {
                         layer_dims: wide(layer.dims),
                         step: layer.step as u32,

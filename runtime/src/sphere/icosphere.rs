@@ -1,8 +1,8 @@
 //! The sphere as a mesh of nearly equal triangles: an icosahedron, halved again and again.
 //!
 //! Level s has `10 4^s + 2` nodes and `20 4^s` triangles: 12, 42, 162, 642, 2562 nodes. Edges are cut in the middle and
-//! the middle is moved out to the sphere, so the children of a triangle cover it exactly, and the triangle of a direction
-//! is found level by level. Cost: twenty products, and three for each level.
+//! the middle is moved out to the sphere. The triangle of a direction is found from one near it, by a table over a cube,
+//! and across the sides that the direction is outside of: three products for each triangle on the way, most often one.
 //! Source: Zhang, Dong and Ma 2013, section 4.1 (the directions of the discrete spherical function).
 
 use glam::DVec3;
@@ -17,11 +17,13 @@ pub struct Icosphere {
     level: u32,
     directions: Vec<DVec3>,
     triangles: Vec<[u32; 3]>,
-    /// For each level, coarsest first, and triangle `abc`, whose children are 4t .. 4t + 4 of the next: `b x c`, `c x a`, `a x b`: how far inside a direction is of the sides across from
-    /// a, b, c, and its place between them once their sum is made 1.
-    sides: Vec<Vec<[DVec3; 3]>>,
-    /// Directions to the middles of the icosahedron's triangles.
-    middles: Vec<DVec3>,
+    /// For each triangle `abc`: `b x c`, `c x a`, `a x b`: how far inside a direction is of the sides across from a, b, c,
+    /// and its place between them once their sum is made 1.
+    sides: Vec<[DVec3; 3]>,
+    /// For each triangle, the one across the side across from a, b, c.
+    across: Vec<[u16; 3]>,
+    /// A triangle near the middle of each field of a cube's faces, `[face][row][column]`.
+    near: Vec<u16>,
 }
 
 impl Icosphere {
@@ -32,7 +34,7 @@ impl Icosphere {
     pub fn new(level: u32) -> Self {
         assert!(level <= MAX_LEVEL, "level {level} is above {MAX_LEVEL}");
         let (mut directions, triangles) = icosahedron();
-        let mut levels = vec![triangles];
+        let mut triangles = triangles;
         for _ in 0..level {
             let mut middles = HashMap::new();
             let mut middle = |a: u32, b: u32| {
@@ -41,22 +43,31 @@ impl Icosphere {
                     directions.len() as u32 - 1
                 })
             };
-            let mut finer = Vec::with_capacity(4 * levels[levels.len() - 1].len());
-            for &[a, b, c] in &levels[levels.len() - 1] {
+            let mut finer = Vec::with_capacity(4 * triangles.len());
+            for &[a, b, c] in &triangles {
                 let (ab, bc, ca) = (middle(a, b), middle(b, c), middle(c, a));
                 finer.extend([[ab, bc, ca], [a, ab, ca], [b, bc, ab], [c, ca, bc]]);
             }
-            levels.push(finer);
+            triangles = finer;
         }
         let sides = |&triangle: &[u32; 3]| {
             let [a, b, c] = triangle.map(|n| directions[n as usize]);
             [b.cross(c), c.cross(a), a.cross(b)]
         };
-        let middle = |triangle: &[u32; 3]| triangle.iter().map(|&n| directions[n as usize]).sum::<DVec3>().normalize();
-        let middles = levels[0].iter().map(middle).collect();
-        let sides = levels.iter().map(|triangles| triangles.iter().map(sides).collect()).collect();
-        let triangles = levels.pop().unwrap_or_default();
-        Self { level, directions, triangles, sides, middles }
+        let sides = triangles.iter().map(sides).collect();
+        let mut of_edge = HashMap::new();
+        for (t, &[a, b, c]) in triangles.iter().enumerate() {
+            // At most 5120 triangles.
+            of_edge.extend([(b, c), (c, a), (a, b)].map(|edge| (edge, t as u16)));
+        }
+        let across = triangles.iter().map(|&[a, b, c]| [(c, b), (a, c), (b, a)].map(|edge| of_edge[&edge])).collect();
+        let mut mesh = Self { level, directions, triangles, sides, across, near: Vec::new() };
+        let mut t = 0;
+        for field in 0..6 * FIELDS * FIELDS {
+            t = mesh.holding(t, middle(field));
+            mesh.near.push(t as u16);
+        }
+        mesh
     }
 
     /// The level with `nodes` nodes, if there is one.
@@ -81,24 +92,28 @@ impl Icosphere {
 
     /// The triangle that holds a unit direction; one of both on a common side.
     pub fn triangle(&self, direction: DVec3) -> usize {
-        // The sides of the icosahedron's triangles are halfway between their middles: the nearest middle is that of the one.
-        let nearest = |best: (f64, usize), (t, middle): (usize, &DVec3)| {
-            let near = middle.dot(direction);
-            if near > best.0 { (near, t) } else { best }
-        };
-        let mut found = self.middles.iter().enumerate().fold((f64::NEG_INFINITY, 0), nearest).1;
-        for sides in &self.sides[1..] {
-            // Beyond the side ab-bc of the middle child lies the child at b, and so on; the most is taken, so that rounding
-            // never finds none.
-            let [c, a, b] = sides[4 * found].map(|side| side.dot(direction));
-            let (least, child) = if a <= b && a <= c {
-                (a, 1)
-            } else if b <= c {
-                (b, 2)
+        self.holding(usize::from(self.near[field(direction)]), direction)
+    }
+
+    /// The triangle that holds a direction, on a way from another.
+    fn holding(&self, from: usize, direction: DVec3) -> usize {
+        let mut found = from;
+        // A way is never as long; rounding, or a direction that is no number, must not make it endless.
+        for _ in 0..self.triangles.len() {
+            let [a, b, c] = self.sides[found].map(|side| side.dot(direction));
+            let least = a.min(b).min(c);
+            // On a side, by rounding outside of both; no number ends the way too.
+            if least >= -5e-16 || least.is_nan() {
+                break;
+            }
+            let side = if least == a {
+                0
+            } else if least == b {
+                1
             } else {
-                (c, 3)
+                2
             };
-            found = 4 * found + if least < 0.0 { child } else { 0 };
+            found = usize::from(self.across[found][side]);
         }
         found
     }
@@ -106,7 +121,7 @@ impl Icosphere {
     /// The place of a unit direction between the corners of a triangle of the finest level: the direction is their sum times
     /// these, up to its length. >= 0 inside, sum 1.
     pub fn barycentric(&self, triangle: usize, direction: DVec3) -> [f64; 3] {
-        let inside = self.sides[self.sides.len() - 1][triangle].map(|side| side.dot(direction).max(0.0));
+        let inside = self.sides[triangle].map(|side| side.dot(direction).max(0.0));
         let sum: f64 = inside.iter().sum();
         inside.map(|v| v / sum)
     }
@@ -125,6 +140,34 @@ impl Icosphere {
             across.extend([((a, b), c), ((b, c), a), ((c, a), b)]);
         }
         self.triangles().iter().map(|&[a, b, c]| [across[&(b, a)], across[&(c, b)], across[&(a, c)]]).collect()
+    }
+}
+
+/// Fields along a side of a face of the cube: at 642 nodes a third of an edge.
+const FIELDS: usize = 32;
+
+/// The field of a direction of any length.
+#[inline(always)]
+fn field(v: DVec3) -> usize {
+    let size = v.abs();
+    let axis = if size.x >= size.y.max(size.z) { 0 } else { 1 + usize::from(size.z > size.y) };
+    let [x, y, z] = v.to_array();
+    let [major, one, other] = [[x, y, z], [y, z, x], [z, x, y]][axis];
+    let scale = (0.5 * FIELDS as f64) / major.abs();
+    let [column, row] = [one, other].map(|c| ((c * scale + 0.5 * FIELDS as f64) as usize).min(FIELDS - 1));
+    ((2 * axis + usize::from(major < 0.0)) * FIELDS + row) * FIELDS + column
+}
+
+/// A direction to the middle of a field, not of unit length.
+fn middle(field: usize) -> DVec3 {
+    let place = |n: usize| (2 * n + 1) as f64 / FIELDS as f64 - 1.0;
+    let (one, other) = (place(field % FIELDS), place(field / FIELDS % FIELDS));
+    let face = field / (FIELDS * FIELDS);
+    let major = if face.is_multiple_of(2) { 1.0 } else { -1.0 };
+    match face / 2 {
+        0 => DVec3::new(major, one, other),
+        1 => DVec3::new(other, major, one),
+        _ => DVec3::new(one, other, major),
     }
 }
 
@@ -188,6 +231,17 @@ pub(crate) mod tests {
                 // A direction on a side may be a rounding outside.
                 assert!(p.cross(q).dot(d) > -1e-15, "{d}");
             }
+        }
+    }
+
+    #[test]
+    fn a_field_of_the_cube_holds_its_middle_and_odd_directions_have_some_triangle() {
+        for at in 0..6 * FIELDS * FIELDS {
+            assert_eq!(field(middle(at)), at);
+        }
+        let mesh = Icosphere::new(2);
+        for d in [DVec3::ZERO, DVec3::NAN, DVec3::X, DVec3::ONE, DVec3::new(-1.0, 1.0, -1.0), DVec3::NEG_Z] {
+            assert!(mesh.triangle(d) < mesh.triangles().len(), "{d}");
         }
     }
 

@@ -347,10 +347,8 @@ impl LightBasis {
 fn square_of_angle(cosine: f64) -> f64 {
     // a_n = 2^n (n - 1)!^2 / (2n)! * 2: each coefficient is n^2 / ((n + 1) (2n + 1)) of the one before.
     let x = (1.0 - cosine).max(0.0);
-    2.0 * x
-        * (1.0
-            + x / 6.0
-                * (1.0 + x * 4.0 / 15.0 * (1.0 + x * 9.0 / 28.0 * (1.0 + x * 16.0 / 45.0 * (1.0 + x * 25.0 / 66.0)))))
+    const RATIOS: [f64; 5] = [25.0 / 66.0, 16.0 / 45.0, 9.0 / 28.0, 4.0 / 15.0, 1.0 / 6.0];
+    2.0 * x * RATIOS.iter().fold(1.0, |sum, ratio| 1.0 + x * ratio * sum)
 }
 
 #[cfg(test)]

@@ -7,7 +7,7 @@ pub mod transfer;
 
 use crate::medium::field::DensityField;
 use crate::shaded_volume::ShadedVolume;
-use compensated::grid::route::GridSource;
+use compensated::centres::source::CentreSource;
 use glam::DVec3;
 use transfer::source::TransferSource;
 
@@ -33,8 +33,8 @@ pub trait SourceRadiance: Send + Sync {
     /// The volume pass: source radiance towards `eye` (world space), into the volume of the same field.
     fn shade(&self, field: &DensityField, eye: DVec3, volume: &mut ShadedVolume);
 
-    /// The planes of the grid route, if it is that: its volume pass has a twin on the device.
-    fn as_grid(&self) -> Option<&GridSource> {
+    /// The radiance at the Gaussians' centres, if it is that: its volume pass has a twin on the device.
+    fn as_centres(&self) -> Option<&CentreSource> {
         None
     }
 

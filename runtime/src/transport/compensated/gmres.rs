@@ -8,7 +8,7 @@
 use rayon::prelude::*;
 
 /// Directions kept before a restart.
-const CYCLE: usize = 30;
+pub(crate) const CYCLE: usize = 30;
 
 /// How a solve ended.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -91,58 +91,94 @@ pub fn solve<E: Entry>(product: impl Fn(&[E], &mut [E]), b: &[E], x: &mut [E], t
             return Solved { iterations, residual: norm / scale };
         }
         let mut basis = vec![scaled(&first, 1.0 / norm)];
-        let mut rotations: Vec<(f64, f64)> = Vec::new();
-        let mut columns: Vec<Vec<f64>> = Vec::new();
-        let mut right = vec![norm];
-        while columns.len() < CYCLE && iterations < limit {
-            let k = columns.len();
-            product(&basis[k], &mut work);
+        let mut small = LeastSquares::new(norm);
+        while small.len() < CYCLE && iterations < limit {
+            product(&basis[small.len()], &mut work);
             iterations += 1;
-            let mut column = Vec::with_capacity(k + 2);
+            let mut column = Vec::with_capacity(basis.len() + 1);
             for v in &basis {
                 let h = dot(v, &work);
                 add(&mut work, -h, v);
                 column.push(h);
             }
             let next = dot(&work, &work).sqrt();
-            for (i, &(c, s)) in rotations.iter().enumerate() {
-                let (a, b) = (column[i], column[i + 1]);
-                (column[i], column[i + 1]) = (c * a + s * b, c * b - s * a);
-            }
-            let length = column[k].hypot(next);
-            // A zero column: the matrix is singular on this space, and the cycle ends with what it has.
-            if length == 0.0 {
-                break;
-            }
-            let (c, s) = (column[k] / length, next / length);
-            rotations.push((c, s));
-            column[k] = length;
-            columns.push(column);
-            right.push(-s * right[k]);
-            right[k] *= c;
-            if right[k + 1].abs() <= tolerance * scale || next <= 1e-14 * length {
+            if !small.push(column, next) || small.rest() <= tolerance * scale {
                 break;
             }
             basis.push(scaled(&work, 1.0 / next));
         }
-        if columns.is_empty() {
+        if small.len() == 0 {
             return Solved { iterations, residual: norm / scale };
         }
-        let count = columns.len();
-        let mut y = vec![0.0; count];
-        for i in (0..count).rev() {
-            let known: f64 = (i + 1..count).map(|j| columns[j][i] * y[j]).sum();
-            y[i] = (right[i] - known) / columns[i][i];
-        }
-        for (v, y) in basis.iter().zip(&y) {
-            add(x, *y, v);
+        for (v, y) in basis.iter().zip(small.solution()) {
+            add(x, y, v);
         }
         // No progress in a whole cycle: more of them would not help.
-        if right[count].abs() > 0.999_999 * norm {
+        if small.rest() > NO_PROGRESS * norm {
             product(x, &mut work);
             let rest: f64 = b.iter().zip(&work).map(|(b, a)| (b.wide() - a.wide()).powi(2)).sum();
             return Solved { iterations, residual: rest.sqrt() / scale };
         }
+    }
+}
+
+/// Share of the residual that a cycle must have left to be the last one.
+pub(crate) const NO_PROGRESS: f64 = 0.999_999;
+
+/// The small system of a cycle: least squares on the Hessenberg matrix, by Givens rotations.
+pub(crate) struct LeastSquares {
+    rotations: Vec<(f64, f64)>,
+    columns: Vec<Vec<f64>>,
+    right: Vec<f64>,
+}
+
+impl LeastSquares {
+    /// Of a cycle whose residual starts at `norm`.
+    pub(crate) fn new(norm: f64) -> Self {
+        Self { rotations: Vec::new(), columns: Vec::new(), right: vec![norm] }
+    }
+
+    /// Columns so far.
+    pub(crate) fn len(&self) -> usize {
+        self.columns.len()
+    }
+
+    /// The next column: its products with the basis, and the length of what is left of it. False where the cycle ends here:
+    /// the column is zero, and not taken, or nothing is left of it.
+    pub(crate) fn push(&mut self, mut column: Vec<f64>, next: f64) -> bool {
+        let k = self.columns.len();
+        for (i, &(c, s)) in self.rotations.iter().enumerate() {
+            let (a, b) = (column[i], column[i + 1]);
+            (column[i], column[i + 1]) = (c * a + s * b, c * b - s * a);
+        }
+        let length = column[k].hypot(next);
+        // A zero column: the matrix is singular on this space, and the cycle ends with what it has.
+        if length == 0.0 {
+            return false;
+        }
+        let (c, s) = (column[k] / length, next / length);
+        self.rotations.push((c, s));
+        column[k] = length;
+        self.columns.push(column);
+        self.right.push(-s * self.right[k]);
+        self.right[k] *= c;
+        next > 1e-14 * length
+    }
+
+    /// Length of the residual that the best combination leaves.
+    pub(crate) fn rest(&self) -> f64 {
+        self.right.last().map_or(0.0, |r| r.abs())
+    }
+
+    /// That combination: a factor for each vector of the basis.
+    pub(crate) fn solution(&self) -> Vec<f64> {
+        let count = self.columns.len();
+        let mut y = vec![0.0; count];
+        for i in (0..count).rev() {
+            let known: f64 = (i + 1..count).map(|j| self.columns[j][i] * y[j]).sum();
+            y[i] = (self.right[i] - known) / self.columns[i][i];
+        }
+        y
     }
 }
 

@@ -19,7 +19,7 @@ use crate::light::Light;
 use crate::medium::field::DensityField;
 use crate::product::add_product;
 use crate::shaded_volume::ShadedVolume;
-use crate::sphere::harmonics::evaluate;
+use crate::sphere::harmonics::{MAX_COEFFICIENTS, evaluate_lanes};
 use crate::sphere::light_basis::BasisKind;
 use crate::tracking::phase;
 use crate::transport::compensated::grid::columns::SweepGrid;
@@ -76,10 +76,13 @@ pub(crate) struct Sun {
 
 /// Radiance of the clusters of one set of direct rows.
 struct LitClusters {
-    /// `[view][cluster][1 + terms]`, RGB and a zero.
+    /// `[cluster][view][term]`, RGB of each direction of a cluster; in the last components of the first three, that of its
+    /// mean. Four terms are a cache line, and views that are blended lie near each other.
     radiance: Vec<Vec4>,
-    /// Numbers of a view.
-    each_view: usize,
+    /// Vectors of a cluster in one view, 3 at least.
+    each: usize,
+    /// Views of a cluster.
+    views: usize,
 }
 
 /// A lit frame: the light's coefficients, and the clusters that the processor has lit with them.
@@ -196,12 +199,30 @@ impl TransferTransport {
     }
 }
 
-/// The radiance of `moments` (`[cell][bands^2]`) along a way for each cell; its last component is 1, see [`Cells::line`].
+/// Cells whose harmonics are found together.
+const LANES: usize = 16;
+
+/// The radiance of `moments` (`[cell][bands^2]`) along the way to each cell, of any length; its last component is 1, see
+/// [`Cells::line`].
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn along_ways(out: &mut [Vec4], moments: &[Vec4], ways: &[Vec3], bands: usize) {
-    for ((out, moments), way) in out.iter_mut().zip(moments.chunks_exact(bands * bands)).zip(ways) {
-        let harmonics = evaluate(bands, *way);
-        *out = moments.iter().zip(harmonics).fold(Vec4::ZERO, |sum, (m, y)| sum + *m * y).with_w(1.0);
+    let n = bands * bands;
+    let mut harmonics = [[0.0; LANES]; MAX_COEFFICIENTS];
+    for ((out, moments), ways) in out.chunks_mut(LANES).zip(moments.chunks(LANES * n)).zip(ways.chunks(LANES)) {
+        let [mut x, mut y, mut z] = [[0.0f32; LANES]; 3];
+        ways.iter().enumerate().for_each(|(lane, way)| [x[lane], y[lane], z[lane]] = way.to_array());
+        for lane in 0..LANES {
+            let squares = x[lane] * x[lane] + y[lane] * y[lane] + z[lane] * z[lane];
+            // At the eye, and in the lanes past the last way, any way will do.
+            let scale = if squares > 0.0 { 1.0 / squares.sqrt() } else { 0.0 };
+            (x[lane], y[lane]) = (x[lane] * scale, y[lane] * scale);
+            z[lane] = if squares > 0.0 { z[lane] * scale } else { 1.0 };
+        }
+        evaluate_lanes(bands, &x, &y, &z, &mut harmonics);
+        for (lane, (out, moments)) in out.iter_mut().zip(moments.chunks_exact(n)).enumerate() {
+            let terms = moments.iter().zip(&harmonics);
+            *out = terms.fold(Vec4::ZERO, |sum, (m, y)| sum + *m * y[lane]).with_w(1.0);
+        }
     }
 }
 
@@ -281,14 +302,22 @@ impl TransferSource {
             let rows = set.bases.len().checked_div(set.length).unwrap_or(0);
             let mut lit = vec![0.0f32; rows * columns];
             add_product(&mut lit, &set.bases, &light, set.length, columns);
-            let at = |view: usize, row: usize| {
-                let mut out = Vec4::ZERO;
-                let from = &lit[row * columns + view * channels.len()..][..channels.len()];
-                channels.iter().zip(from).for_each(|(&c, v)| out[c] = *v);
-                out
-            };
-            let radiance = (0..views.len() * rows).into_par_iter().map(|i| at(i / rows, i % rows)).collect();
-            LitClusters { radiance, each_view: rows }
+            // From [cluster][1 + term][view][channel].
+            let each = set.terms.max(3);
+            let mut radiance = vec![Vec4::ZERO; set.clusters() * views.len() * each];
+            let clusters = radiance.par_chunks_exact_mut((views.len() * each).max(1));
+            clusters.zip(lit.par_chunks_exact((1 + set.terms) * columns.max(1))).for_each(|(out, lit)| {
+                let (mean, directions) = lit.split_at(columns);
+                for (out, mean) in out.chunks_exact_mut(each).zip(mean.chunks_exact(channels.len())) {
+                    channels.iter().zip(mean).for_each(|(&c, v)| out[c].w = *v);
+                }
+                for (t, row) in directions.chunks_exact(columns).enumerate() {
+                    for (out, from) in out.chunks_exact_mut(each).zip(row.chunks_exact(channels.len())) {
+                        channels.iter().zip(from).for_each(|(&c, v)| out[t][c] = *v);
+                    }
+                }
+            });
+            LitClusters { radiance, each, views: views.len() }
         };
         transfer.direct.iter().enumerate().map(of_set).collect()
     }
@@ -317,10 +346,9 @@ impl SourceRadiance for TransferSource {
         // Where only suns shine, there is no direct light of clusters.
         let even = self.even();
         let seen = (even.is_none() && self.irradiance.iter().any(|e| *e != [0.0; 3])).then(|| {
-            let (corners, side) = volume.corners();
-            let corners: Vec<Vec3> = corners.map(along).collect();
+            let boxes: Vec<_> = volume.table.runs().map(|(corner, sides)| (along(corner), sides)).collect();
             let edges = [linear.x_axis, linear.y_axis, linear.z_axis].map(|edge| edge.as_vec3());
-            let directions = ViewDirections::of_boxes(&corners, edges, side, squares);
+            let directions = ViewDirections::of_boxes(&boxes, edges, squares);
             let lit = self.lit_clusters(directions.directions());
             (directions, lit)
         });
@@ -364,63 +392,77 @@ struct Line {
     across: Vec3,
 }
 
-/// Writes the lit nodes of a line; `cells` are sums along it, see [`Cells::line`].
+/// Writes the lit nodes of a line, one kind of light after another; `cells` are sums along it, see [`Cells::line`].
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn shade_line(source: &TransferSource, direct: &Direct, cells: &[Vec4], line: Line, out: &mut [[f32; 4]]) {
     let g = source.transfer.medium.g;
-    for (row, &node) in line.rows.clone().zip(&source.nodes[line.rows]) {
-        let i = node as usize - line.before;
-        let way = line.first + line.across * i as f32;
-        let mut sum = source.cells.between(i, cells);
-        sum += match direct {
-            Direct::Even(lit) => source.direct(lit, row, [(0, 1.0)]),
-            Direct::Seen(view, squares, lit) => source.direct(lit, row, view.around(Between::of(way, *squares))),
-            Direct::None => Vec4::ZERO,
-        };
-        for sun in &source.suns {
-            let cosine = if g == 0.0 { 0.0 } else { way.normalize_or(Vec3::Z).dot(sun.toward) };
-            let scattered = phase::value(g, cosine);
-            (0..3).for_each(|c| sum[c] += scattered * sun.power[c] * sun.transmittance[c][row]);
+    let nodes = &source.nodes[line.rows.clone()];
+    let along = |node: u32| (node as usize - line.before) as f32;
+    let mut sums: Vec<Vec4> =
+        nodes.iter().map(|&node| source.cells.between(node as usize - line.before, cells)).collect();
+    match direct {
+        Direct::Even(lit) => source.add_direct(lit, line.rows.clone(), &vec![([0], [1.0]); nodes.len()], &mut sums),
+        Direct::Seen(view, squares, lit) => {
+            let around = |&node| view.around(Between::of(line.first + line.across * along(node), *squares));
+            let views: Vec<_> = nodes.iter().map(around).collect();
+            source.add_direct(lit, line.rows.clone(), &views, &mut sums);
         }
+        Direct::None => {}
+    }
+    for sun in &source.suns {
+        let [red, green, blue] = sun.transmittance.each_ref().map(|t| &t[line.rows.clone()]);
+        for (at, (sum, &node)) in sums.iter_mut().zip(nodes).enumerate() {
+            let way = line.first + line.across * along(node);
+            let cosine = if g == 0.0 { 0.0 } else { way.normalize_or(Vec3::Z).dot(sun.toward) };
+            let [r, g, b] = sun.power.map(|power| power * phase::value(g, cosine));
+            *sum += Vec4::new(r * red[at], g * green[at], b * blue[at], 0.0);
+        }
+    }
+    for (sum, &node) in sums.iter().zip(nodes) {
+        let out = &mut out[node as usize - line.before];
         // A truncated series can dip below zero; radiance cannot.
-        out[i] = sum.max(Vec4::ZERO).with_w(out[i][3]).to_array();
+        *out = sum.max(Vec4::ZERO).with_w(out[3]).to_array();
     }
 }
 
 impl TransferSource {
-    /// Direct radiance of the lit node `row`, a weighted mean of that along `views` of `lit`, by [`Self::lit_clusters`].
+    /// Adds the direct radiance of the lit nodes `rows`, weighted means of that along `views` of `lit`, which is by
+    /// [`Self::lit_clusters`]: for each node their places and weights.
     #[inline(always)]
-    fn direct<const N: usize>(&self, lit: &[LitClusters], row: usize, views: [(u32, f32); N]) -> Vec4 {
-        let mut sum = Vec4::ZERO;
+    fn add_direct<const N: usize>(
+        &self,
+        lit: &[LitClusters],
+        rows: Range<usize>,
+        views: &[([u32; N], [f32; N])],
+        sums: &mut [Vec4],
+    ) {
         for (set, lit) in self.transfer.direct.iter().zip(lit) {
-            let weights = &set.weights[row * set.terms..][..set.terms];
-            let (each, cluster) = (1 + set.terms, usize::from(set.ids[row]));
-            let of = |view: u32| &lit.radiance[view as usize * lit.each_view + cluster * each..][..each];
-            match weights.first_chunk::<4>() {
-                // What most packs have: views are blended first, twenty numbers at a time.
-                Some(weights) if each == 5 => {
-                    let mut blended = [0.0f32; 20];
-                    for (view, share) in views {
-                        let Some(radiance) = bytemuck::cast_slice::<_, f32>(of(view)).first_chunk::<20>() else {
-                            break;
-                        };
-                        (0..20).for_each(|at| blended[at] += share * radiance[at]);
+            let ids = &set.ids[rows.clone()];
+            let weights = &set.weights[rows.start * set.terms..rows.end * set.terms];
+            let of = |id: u8, view: u32| &lit.radiance[(usize::from(id) * lit.views + view as usize) * lit.each..];
+            let mean = |v: &[Vec4]| Vec4::new(v[0].w, v[1].w, v[2].w, 0.0);
+            let each = sums.iter_mut().zip(ids).zip(views);
+            // What most packs have is unrolled.
+            if let (4, (weights, [])) = (set.terms, weights.as_chunks::<4>()) {
+                for (((sum, &id), (places, shares)), weights) in each.zip(weights) {
+                    let mut blended = [Vec4::ZERO; 4];
+                    for (&place, &share) in places.iter().zip(shares) {
+                        let Some(radiance) = of(id, place).first_chunk::<4>() else { break };
+                        (0..4).for_each(|t| blended[t] += radiance[t] * share);
                     }
-                    let vector = |t: usize| Vec4::from_slice(&blended[4 * t..][..4]);
-                    sum += vector(0)
-                        + (vector(1) * weights[0] + vector(2) * weights[1])
-                        + (vector(3) * weights[2] + vector(4) * weights[3]);
+                    let [a, b, c, d] = [0, 1, 2, 3].map(|t| blended[t] * weights[t]);
+                    *sum += mean(&blended) + ((a + b) + (c + d));
                 }
-                _ => {
-                    for (view, share) in views {
-                        let radiance = of(view);
-                        let directions = radiance[1..].iter().zip(weights);
-                        sum += directions.fold(radiance[0], |sum, (d, w)| sum + *d * *w) * share;
+            } else {
+                for (at, ((sum, &id), (places, shares))) in each.enumerate() {
+                    let weights = &weights[at * set.terms..][..set.terms];
+                    for (&place, &share) in places.iter().zip(shares) {
+                        let radiance = of(id, place);
+                        *sum += radiance.iter().zip(weights).fold(mean(radiance), |sum, (d, w)| sum + *d * *w) * share;
                     }
                 }
             }
         }
-        sum
     }
 
     /// Indirect radiance of each cell the way it is seen from `eye`.
@@ -428,9 +470,13 @@ impl TransferSource {
         let bands = self.transfer.bands;
         let (n, side) = (bands * bands, self.cells.majorants.side);
         let [bx, by, _] = self.cells.majorants.bricks;
+        // Ways are as long as the smoke is far, in bricks: their squares fit single precision in any units.
+        let linear = field.world_from_node.matrix3 * side;
+        let linear = (linear * linear.determinant().abs().cbrt().recip()).as_mat3();
+        let node_eye = field.world_from_node.inverse().transform_point3(eye) / side - 0.5;
         let middle = |brick: usize| {
-            let at = [brick % bx, brick / bx % by, brick / bx / by].map(|b| (b as f64 + 0.5) * side);
-            (field.world_from_node.transform_point3(DVec3::from_array(at)) - eye).normalize_or(DVec3::Z).as_vec3()
+            let at = DVec3::new((brick % bx) as f64, (brick / bx % by) as f64, (brick / bx / by) as f64);
+            linear * (at - node_eye).as_vec3()
         };
         let mut out = vec![Vec4::ZERO; self.cells.len()];
         let blocks = out.par_chunks_mut(1024).zip(self.moments().par_chunks(1024 * n));

@@ -67,38 +67,24 @@ impl Between {
 }
 
 impl ViewDirections {
-    /// The corners of the squares that the nodes of boxes lie in: node `[i, j, k]` at `corner + i edges[0] + ...` from the
-    /// eye, `0 <= i, j, k <= side`. A box whose corners are seen through one face lies between them there, as lines stay
-    /// lines; of others each node is looked at.
-    pub fn of_boxes(corners: &[Vec3], edges: [Vec3; 3], side: usize, squares: usize) -> Self {
-        let at = |corner: Vec3, [i, j, k]: [usize; 3]| {
-            let [i, j, k] = [i, j, k].map(|n| n as f32);
-            Between::of(corner + edges[0] * i + edges[1] * j + edges[2] * k, squares).square
-        };
+    /// The corners of the squares that the nodes of boxes lie in: for each box its first node from the eye and its sides;
+    /// node `[i, j, k]` lies at `first + i edges[0] + ...`, `0 <= i <= sides[0]` and so on.
+    pub fn of_boxes(boxes: &[(Vec3, [usize; 3])], edges: [Vec3; 3], squares: usize) -> Self {
         let nothing = || vec![false; 6 * (squares + 1) * (squares + 1)];
-        let mark = |mut marks: Vec<bool>, corner: &Vec3| {
-            let n = squares + 1;
-            let (mut low, mut high) = ([usize::MAX; 3], [0; 3]);
-            for c in 0..8 {
-                let square = at(*corner, [c & 1, c >> 1 & 1, c >> 2].map(|bit| bit * side));
-                let place = [square % n, square / n % n, square / n / n];
-                (0..3).for_each(|a| (low[a], high[a]) = (low[a].min(place[a]), high[a].max(place[a])));
-            }
-            if low[2] == high[2] {
-                for row in low[1]..=high[1] {
-                    marks[(low[2] * n + row) * n..][low[0]..=high[0]].fill(true);
-                }
-            } else {
-                let n = side + 1;
-                (0..n * n * n).for_each(|v| marks[at(*corner, [v % n, v / n % n, v / n / n])] = true);
-            }
+        let mark = |mut marks: Vec<bool>, (first, sides): &(Vec3, [usize; 3])| {
+            let square =
+                |[i, j, k]: [f32; 3]| Between::of(*first + edges[0] * i + edges[1] * j + edges[2] * k, squares).square;
+            let edge = edges.iter().fold(f32::INFINITY, |least, edge| least.min(edge.length()));
+            let nodes_away = first.abs().max_element() / edge.max(f32::MIN_POSITIVE);
+            let margin = (LEAST_MARGIN + 1e-6 * nodes_away).min(0.05);
+            mark(&mut marks, &square, squares + 1, margin, [0; 3], *sides);
             marks
         };
         let either = |mut a: Vec<bool>, b: Vec<bool>| {
             a.iter_mut().zip(b).for_each(|(a, b)| *a |= b);
             a
         };
-        let marks = corners.par_iter().fold(nothing, mark).reduce(nothing, either);
+        let marks = boxes.par_iter().fold(nothing, mark).reduce(nothing, either);
         let mut places = vec![UNUSED; marks.len()];
         let mut directions = Vec::new();
         for square in (0..marks.len()).filter(|&s| marks[s]) {
@@ -129,11 +115,56 @@ impl ViewDirections {
 
     /// Places in [`Self::directions`] of the four corners around a direction that was seen, and their weights.
     #[inline(always)]
-    pub fn around(&self, between: Between) -> [(u32, f32); 4] {
+    pub fn around(&self, between: Between) -> ([u32; 4], [f32; 4]) {
         let [f, g] = between.fraction;
         let weights = [(1.0 - f) * (1.0 - g), f * (1.0 - g), (1.0 - f) * g, f * g];
         let corners = between.corners(self.squares);
-        [0, 1, 2, 3].map(|c| (self.places[corners[c]], weights[c]))
+        // A corner that is not in use has next to no weight, by rounding.
+        let last = self.directions.len().saturating_sub(1) as u32;
+        (corners.map(|c| self.places[c].min(last)), weights)
+    }
+}
+
+/// What a box of nodes is enlarged by at least, in nodes, and more from far away: a node that is rounded to another square
+/// than here has that one as well.
+const LEAST_MARGIN: f32 = 1e-3;
+
+/// Marks the squares of the nodes `low` to `high`; `square` is that of a place in nodes, a face has `n` to a row. A box
+/// whose corners are seen through one face lies between them there, as lines stay lines; others are halved, and those with
+/// more squares between them than nodes along a side.
+fn mark(
+    marks: &mut [bool],
+    square: &impl Fn([f32; 3]) -> usize,
+    n: usize,
+    margin: f32,
+    low: [usize; 3],
+    high: [usize; 3],
+) {
+    let corner = |c: usize| {
+        square([0, 1, 2].map(|a| if c >> a & 1 == 0 { low[a] as f32 - margin } else { high[a] as f32 + margin }))
+    };
+    let squares = [0, 1, 2, 3, 4, 5, 6, 7].map(corner);
+    let places = squares.map(|square| [square % n, square / n % n, square / n / n]);
+    let [first, last] = [usize::min, usize::max].map(|most: fn(usize, usize) -> usize| {
+        places.iter().fold(places[0], |so_far, place| [0, 1, 2].map(|a| most(so_far[a], place[a])))
+    });
+    let longest = [0, 1, 2].into_iter().max_by_key(|&a| high[a] - low[a]).unwrap_or(0);
+    // A slanted box, or one near the eye, passes few of the squares between its corners.
+    let between = (last[0] - first[0] + 1) * (last[1] - first[1] + 1);
+    if first[2] == last[2] && between <= high[longest] - low[longest] + 1 {
+        for row in first[1]..=last[1] {
+            marks[(first[2] * n + row) * n..][first[0]..=last[0]].fill(true);
+        }
+    } else if high[longest] > low[longest] {
+        let middle = (low[longest] + high[longest]) / 2;
+        let (mut end, mut start) = (high, low);
+        (end[longest], start[longest]) = (middle, middle + 1);
+        mark(marks, square, n, margin, low, end);
+        mark(marks, square, n, margin, start, high);
+    } else {
+        // At the eye, or near it, its own square may be none of its corners'.
+        let own = square(low.map(|n| n as f32));
+        squares.iter().chain([&own]).for_each(|&square| marks[square] = true);
     }
 }
 
@@ -158,12 +189,13 @@ mod tests {
     #[test]
     fn a_direction_lies_between_the_corners_of_its_square_whatever_its_face() {
         let seen: Vec<DVec3> = directions(5000).collect();
-        let points: Vec<Vec3> = seen.iter().map(|v| v.as_vec3() * 3.7).collect();
-        let view = ViewDirections::of_boxes(&points, [Vec3::ZERO; 3], 1, 32);
+        let points: Vec<_> = seen.iter().map(|v| (v.as_vec3() * 3.7, [1; 3])).collect();
+        let view = ViewDirections::of_boxes(&points, [Vec3::ZERO; 3], 32);
         for v in &seen {
-            let around = view.around(Between::of(v.as_vec3() * 3.7, 32));
-            assert!((around.iter().map(|a| a.1).sum::<f32>() - 1.0).abs() < 1e-6);
-            let mean = around.iter().fold(DVec3::ZERO, |s, (d, w)| s + view.directions()[*d as usize] * f64::from(*w));
+            let (places, weights) = view.around(Between::of(v.as_vec3() * 3.7, 32));
+            assert!((weights.iter().sum::<f32>() - 1.0).abs() < 1e-6);
+            let around = places.iter().zip(weights);
+            let mean = around.fold(DVec3::ZERO, |s, (d, w)| s + view.directions()[*d as usize] * f64::from(w));
             // A linear function, off by h^2 / 8 at most.
             assert!((mean - *v).length() < 0.0625f64.powi(2) / 4.0, "{v} {mean}");
         }
@@ -172,26 +204,28 @@ mod tests {
 
     #[test]
     fn every_node_of_a_box_has_its_corners_near_and_far_around_the_eye_too() {
-        for corner in [Vec3::new(20.0, 3.0, -4.0), Vec3::new(-2.0, -1.5, -2.2), Vec3::new(3.0, -2.0, 2.9)] {
+        let eyes = [Vec3::new(20.0, 3.0, -4.0), Vec3::new(-2.0, -1.5, -2.2), Vec3::new(3.0, -2.0, 2.9)];
+        for corner in eyes.into_iter().chain([Vec3::new(-1.0, -2.1, -1.0), Vec3::splat(-1.01), Vec3::ZERO]) {
             let edges = [Vec3::new(1.0, 0.1, 0.0), Vec3::Y, Vec3::new(0.0, -0.2, 1.0)];
-            let view = ViewDirections::of_boxes(&[corner], edges, 4, 20);
+            let view = ViewDirections::of_boxes(&[(corner, [4; 3])], edges, 20);
             for v in 0..125 {
                 let at =
                     corner + edges[0] * (v % 5) as f32 + edges[1] * (v / 5 % 5) as f32 + edges[2] * (v / 25) as f32;
-                let around = view.around(Between::of(at, 20));
-                assert!(around.iter().all(|(d, _)| (*d as usize) < view.directions().len()), "{at}");
+                let corners = Between::of(at, 20).corners(20);
+                assert!(corners.iter().all(|&c| view.places[c] != UNUSED), "{at}");
             }
         }
     }
 
     #[test]
     fn only_what_is_seen_is_used_and_odd_vectors_are_no_trouble() {
-        let near = [Vec3::new(1.0, 0.1, 0.1), Vec3::new(1.0, 0.11, 0.1)];
-        let view = ViewDirections::of_boxes(&near, [Vec3::X * 0.01, Vec3::Y * 0.001, Vec3::Z * 0.001], 4, 12);
+        let near = [Vec3::new(1.0, 0.1, 0.1), Vec3::new(1.0, 0.11, 0.1)].map(|corner| (corner, [4; 3]));
+        let view = ViewDirections::of_boxes(&near, [Vec3::X * 0.01, Vec3::Y * 0.001, Vec3::Z * 0.001], 12);
         assert_eq!(view.directions().len(), 4);
         for v in [Vec3::ZERO, Vec3::ONE, Vec3::new(-1.0, 1.0, -1.0), Vec3::new(0.0, -1e-38, 0.0), Vec3::splat(1e30)] {
-            let view = ViewDirections::of_boxes(&[v], [Vec3::ZERO; 3], 1, 12);
-            assert!(view.around(Between::of(v, 12)).iter().all(|(d, w)| (*d as usize) < 4 && w.is_finite()));
+            let view = ViewDirections::of_boxes(&[(v, [1; 3])], [Vec3::ZERO; 3], 12);
+            let (places, weights) = view.around(Between::of(v, 12));
+            assert!(places.iter().all(|d| *d < 4) && weights.iter().all(|w| w.is_finite()));
         }
     }
 }

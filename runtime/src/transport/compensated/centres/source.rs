@@ -38,8 +38,8 @@ impl UnitPlacement {
 
 /// The centres' radiance, with what the volume pass needs to interpolate it.
 pub struct CentreSource {
-    points: GaussianPoints,
-    radiance: CentreRadiance,
+    pub(crate) points: GaussianPoints,
+    pub(crate) radiance: CentreRadiance,
     unit: UnitSpace,
     placement: UnitPlacement,
     first_node: [i32; 3],
@@ -50,16 +50,35 @@ impl CentreSource {
     pub fn new(points: GaussianPoints, radiance: CentreRadiance, frame: &Frame, placement: UnitPlacement) -> Self {
         Self { points, radiance, unit: frame.unit, placement, first_node: frame.first_node }
     }
+
+    /// True if light goes out alike in all directions.
+    pub(crate) fn is_even(&self) -> bool {
+        let bands = self.radiance.order * self.radiance.order;
+        self.radiance.coefficients.chunks_exact(bands).all(|j| j[1..].iter().all(|v| *v == [0.0; 3]))
+    }
+
+    /// Unit coordinates of the first `count` nodes along `axis`.
+    pub fn axis(&self, axis: usize, count: usize) -> impl Iterator<Item = f32> {
+        (0..count).map(move |i| self.unit.coordinate(axis, self.first_node[axis].saturating_add(i as i32)))
+    }
+
+    /// A point of the world in unit space.
+    pub fn unit_from_world(&self, point: DVec3) -> DVec3 {
+        self.placement.unit_from_world.transform_point3(point)
+    }
 }
 
 impl SourceRadiance for CentreSource {
     fn depends_on_view(&self) -> bool {
-        let bands = self.radiance.order * self.radiance.order;
-        self.radiance.coefficients.chunks_exact(bands).any(|j| j[1..].iter().any(|v| *v != [0.0; 3]))
+        !self.is_even()
+    }
+
+    fn as_centres(&self) -> Option<&CentreSource> {
+        Some(self)
     }
 
     fn shade(&self, field: &DensityField, eye: DVec3, volume: &mut ShadedVolume) {
-        let eye = self.placement.unit_from_world.transform_point3(eye).as_vec3().to_array();
+        let eye = self.unit_from_world(eye).as_vec3().to_array();
         let view = ViewDirections::Eye(eye);
         let source = volume_pass(&self.points, &self.radiance, &self.unit, self.first_node, field.dims, view);
         let [nx, ny, _] = field.dims;

@@ -10,7 +10,7 @@
 //! Cost: one visit a node and direction, all loops along rows without branches.
 
 use crate::medium::field::DensityField;
-use glam::{DVec3, Vec3};
+use glam::{DMat3, DVec3, Vec3};
 use std::ops::Range;
 
 /// A field in the two layouts that sweeps need: rows must not run along the dominant axis.
@@ -23,7 +23,7 @@ pub struct SweepGrid {
     turned: Vec<f32>,
     /// For both layouts and each row, the nodes within [`REACH`] of density.
     active: [Vec<Range<usize>>; 2],
-    node_from_world: glam::DMat3,
+    node_from_world: DMat3,
 }
 
 /// Nodes further than this from any density are left out: they emit nothing and are never read with weight. A ray moves
@@ -41,8 +41,8 @@ pub struct Slices {
     pub columns: usize,
     /// Rows of a slice.
     pub rows: usize,
-    slice_stride: usize,
-    row_stride: usize,
+    pub(crate) slice_stride: usize,
+    pub(crate) row_stride: usize,
 }
 
 impl Slices {
@@ -60,7 +60,8 @@ pub struct Path {
     pub slices: Slices,
     /// World length between two slices.
     pub length: f32,
-    reversed: bool,
+    /// Whether it meets the last slice first.
+    pub reversed: bool,
     slope: [f64; 2],
     first: [isize; 2],
     /// Columns and rows of the array of rays.
@@ -130,9 +131,16 @@ impl SweepGrid {
     /// The way of rays that come in from direction `toward` (unit vector, world space): slices in the order in which
     /// light from there meets them.
     pub fn path(&self, toward: Vec3) -> Path {
-        let v: DVec3 = self.node_from_world * toward.as_dvec3();
+        Path::new(self.dims, self.node_from_world, toward)
+    }
+}
+
+impl Path {
+    /// See [`SweepGrid::path`]; `node_from_world` is the linear map to node space.
+    pub fn new(dims: [usize; 3], node_from_world: DMat3, toward: Vec3) -> Self {
+        let v: DVec3 = node_from_world * toward.as_dvec3();
         let axis = (0..3).max_by(|&a, &b| v[a].abs().total_cmp(&v[b].abs())).unwrap_or(2);
-        let [nx, ny, nz] = self.dims;
+        let [nx, ny, nz] = dims;
         let (slices, across) = match axis {
             0 => {
                 let slices =
@@ -163,9 +171,7 @@ impl SweepGrid {
         let length = (1.0 / v[axis].abs()) as f32;
         Path { slices, length, reversed: v[axis] > 0.0, slope, first: reach, extent }
     }
-}
 
-impl Path {
     /// Which of the six senses (axis and sign) the path has: paths of one group visit slices in the same order.
     pub fn group(&self) -> usize {
         let axis = if self.slices.turned {
@@ -218,15 +224,7 @@ pub fn stencil(out: &mut [f32], low: &[f32], high: &[f32], weights: [[f32; 2]; 2
 /// The active columns of every row, in both layouts.
 fn active_rows(field: &DensityField) -> [Vec<Range<usize>>; 2] {
     let [nx, ny, nz] = field.dims;
-    let mut near: Vec<bool> = field.values.iter().map(|&d| d > 0.0).collect();
-    for (n, stride) in [(nx, 1), (ny, nx), (nz, nx * ny)] {
-        let dense = near.clone();
-        for (v, near) in near.iter_mut().enumerate() {
-            let at = v / stride % n;
-            let (back, on) = (REACH.min(at), REACH.min(n - 1 - at));
-            *near = (0..=back + on).any(|s| dense[v + s * stride - back * stride]);
-        }
-    }
+    let near = near_density(field);
     let mut rows = [vec![0..0; ny * nz], vec![0..0; nz * nx]];
     let widen = |row: &mut Range<usize>, at: usize| {
         *row = if Range::is_empty(row) { at..at + 1 } else { row.start.min(at)..row.end.max(at + 1) };
@@ -237,6 +235,21 @@ fn active_rows(field: &DensityField) -> [Vec<Range<usize>>; 2] {
         widen(&mut rows[1][k + nz * i], j);
     }
     rows
+}
+
+/// Which nodes are within [`REACH`] of density, x fastest.
+pub fn near_density(field: &DensityField) -> Vec<bool> {
+    let [nx, ny, nz] = field.dims;
+    let mut near: Vec<bool> = field.values.iter().map(|&d| d > 0.0).collect();
+    for (n, stride) in [(nx, 1), (ny, nx), (nz, nx * ny)] {
+        let dense = near.clone();
+        for (v, near) in near.iter_mut().enumerate() {
+            let at = v / stride % n;
+            let (back, on) = (REACH.min(at), REACH.min(n - 1 - at));
+            *near = (0..=back + on).any(|s| dense[v + s * stride - back * stride]);
+        }
+    }
+    near
 }
 
 /// From x fastest to y fastest, then z, then x.
@@ -271,7 +284,7 @@ mod tests {
     #[test]
     fn a_linear_function_goes_to_the_rays_and_back_unchanged() {
         let dims = [9, 7, 8];
-        let shear = glam::DMat3::from_cols_array(&[0.7, 0.1, 0.0, -0.2, 1.1, 0.3, 0.0, 0.4, 0.9]);
+        let shear = DMat3::from_cols_array(&[0.7, 0.1, 0.0, -0.2, 1.1, 0.3, 0.0, 0.4, 0.9]);
         let value = |i: usize, j: usize, k: usize| 3.0 + i as f32 - 2.0 * j as f32 + 0.5 * k as f32;
         let values = (0..504).map(|v| value(v % 9, v / 9 % 7, v / 63)).collect();
         let field = DensityField { dims, values, world_from_node: DAffine3::from_mat3(shear) };

@@ -137,22 +137,81 @@ impl GridTransport {
         scattering: ScatteringOrder,
     ) -> GridSource {
         let settings = self.settings;
-        let bands = (1..=MAX_ORDER).rev().find(|&b| medium.moments[b - 1].abs() > 1e-6).unwrap_or(1);
-        let channels = channels(medium, beams);
-        let step = if settings.single_step == 0 { single_step(field) } else { settings.single_step };
-        let single = single_layer(self.grid(field, step), step, beams, medium, (bands, channels));
-        let scatters = medium.albedo.iter().any(|&a| a > 0.0) && medium.sigma_t.iter().any(|&s| s > 0.0);
-        if scattering == ScatteringOrder::Single || !scatters || beams.is_empty() {
+        let plan = Plan::new(&settings, field, beams, medium, scattering);
+        let Plan { bands, channels, single_step, multiple } = plan;
+        let single = single_layer(self.grid(field, single_step), single_step, beams, medium, (bands, channels));
+        let Some((step, bands)) = multiple else {
             return GridSource { channels, single, multiple: None, iterations: 0, residual: 0.0 };
-        }
-        let thickest = medium.sigma_t.iter().copied().fold(0.0, f32::max);
-        let step = if settings.multiple_step == 0 { multiple_step(field, thickest) } else { settings.multiple_step };
-        let bands = bands.min(settings.multiple_order.max(1));
+        };
         let grid = self.grid(field, step);
         let first = single_layer(grid, step, beams, medium, (bands, channels));
         let (multiple, iterations, residual) = multiple_layer(grid, first, medium, (bands, channels), &settings);
         GridSource { channels, single, multiple: Some(multiple), iterations, residual }
     }
+}
+
+/// What is solved for: spacings, bands and channels.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Plan {
+    /// Bands of single scattering.
+    pub bands: usize,
+    /// 1 where all three channels are the same, else 3.
+    pub channels: usize,
+    /// Spacing of the single-scattering nodes, in voxels.
+    pub single_step: usize,
+    /// Spacing and bands of multiple scattering, where there is any.
+    pub multiple: Option<(usize, usize)>,
+}
+
+impl Plan {
+    /// The choices for `field` under `beams`.
+    pub fn new(
+        settings: &GridSettings,
+        field: &DensityField,
+        beams: &[Beam],
+        medium: &BandedMedium,
+        scattering: ScatteringOrder,
+    ) -> Self {
+        let bands = (1..=MAX_ORDER).rev().find(|&b| medium.moments[b - 1].abs() > 1e-6).unwrap_or(1);
+        let step = settings.single_step;
+        let single_step = if step == 0 { single_step(field) } else { step };
+        let scatters = medium.albedo.iter().any(|&a| a > 0.0) && medium.sigma_t.iter().any(|&s| s > 0.0);
+        let multiple = (scattering == ScatteringOrder::All && scatters && !beams.is_empty()).then(|| {
+            let (step, thickest) = (settings.multiple_step, medium.sigma_t.iter().copied().fold(0.0, f32::max));
+            let step = if step == 0 { multiple_step(field, thickest) } else { step };
+            (step, bands.min(settings.multiple_order.max(1)))
+        });
+        Self { bands, channels: channels(medium, beams), single_step, multiple }
+    }
+}
+
+/// The beams with what each adds to the coefficients of `bands` bands.
+pub fn weighted(beams: &[Beam], medium: &BandedMedium, (bands, channels): (usize, usize)) -> Vec<WeightedBeam> {
+    let weighted = |beam: &Beam| {
+        let harmonics = evaluate(bands, beam.toward);
+        let weight = |plane: usize| {
+            let (k, c) = (plane / channels, plane % channels);
+            medium.albedo[c] * (medium.moments[BAND[k]] * harmonics[k]) * beam.irradiance[c]
+        };
+        WeightedBeam { beam: *beam, weights: (0..bands * bands * channels).map(weight).collect() }
+    };
+    beams.iter().map(weighted).collect()
+}
+
+/// The directions that multiple scattering is gathered along.
+pub fn ordinates(rings: usize, bands: usize) -> Vec<Ordinate> {
+    let directions = Directions::product(rings, 2 * rings);
+    let ordinate = |q: usize| {
+        let toward = directions.direction(q);
+        let harmonics = evaluate(bands, toward)[..bands * bands].to_vec();
+        Ordinate { toward, weight: directions.weights[q], harmonics }
+    };
+    (0..directions.len()).map(ordinate).collect()
+}
+
+/// How much of what is gathered in a plane is scattered again: `albedo g^l`.
+pub fn gain(medium: &BandedMedium, channels: usize, plane: usize) -> f32 {
+    medium.albedo[plane % channels] * medium.moments[BAND[plane / channels]]
 }
 
 fn single_layer(
@@ -162,17 +221,7 @@ fn single_layer(
     medium: &BandedMedium,
     (bands, channels): (usize, usize),
 ) -> Layer {
-    let weighted: Vec<WeightedBeam> = beams
-        .iter()
-        .map(|beam| {
-            let harmonics = evaluate(bands, beam.toward);
-            let weight = |plane: usize| {
-                let (k, c) = (plane / channels, plane % channels);
-                medium.albedo[c] * (medium.moments[BAND[k]] * harmonics[k]) * beam.irradiance[c]
-            };
-            WeightedBeam { beam: *beam, weights: (0..bands * bands * channels).map(weight).collect() }
-        })
-        .collect();
+    let weighted = weighted(beams, medium, (bands, channels));
     Layer { step, dims: grid.dims, planes: single_scattering(grid, &weighted, &medium.sigma_t[..channels]) }
 }
 
@@ -184,21 +233,14 @@ fn multiple_layer(
     (bands, channels): (usize, usize),
     settings: &GridSettings,
 ) -> (Layer, usize, f64) {
-    let directions = Directions::product(settings.rings, 2 * settings.rings);
-    let ordinates: Vec<Ordinate> = (0..directions.len())
-        .map(|q| {
-            let toward = directions.direction(q);
-            let harmonics = evaluate(bands, toward)[..bands * bands].to_vec();
-            Ordinate { toward, weight: directions.weights[q], harmonics }
-        })
-        .collect();
+    let ordinates = ordinates(settings.rings, bands);
     let n = grid.len();
     // (1 - F K) x, all planes one after the other.
     let product = |x: &[f32], out: &mut [f32]| {
         let source: Vec<Vec<f32>> = x.chunks(n).map(<[f32]>::to_vec).collect();
         let gathered = gather(grid, &ordinates, &medium.sigma_t[..channels], &source);
         out.par_chunks_mut(n).zip(x.par_chunks(n)).enumerate().for_each(|(plane, (out, x))| {
-            let gain = medium.albedo[plane % channels] * medium.moments[BAND[plane / channels]];
+            let gain = gain(medium, channels, plane);
             out.iter_mut().zip(x).zip(&gathered[plane]).for_each(|((o, x), g)| *o = x - gain * g);
         });
     };
@@ -219,10 +261,6 @@ impl GridSource {
 }
 
 impl SourceRadiance for GridSource {
-    fn as_grid(&self) -> Option<&GridSource> {
-        Some(self)
-    }
-
     fn depends_on_view(&self) -> bool {
         self.single.planes.len() > self.channels
     }

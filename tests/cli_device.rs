@@ -1,0 +1,111 @@
+//! `render --device gpu` through the binary: the frames that the processor renders, all of them, once each, by every
+//! method. `SMOKE_GPU` decides: `off` leaves it out, `auto` (the default) takes the best device there is, `require` fails
+//! where there is none.
+#![cfg(feature = "gpu")]
+
+mod common;
+
+use common::{PLUME, answer};
+use serde_json::Value;
+use smoke_formats::image::{self, FloatImage};
+use std::path::Path;
+
+/// Relative RMSE that images are promised to agree to.
+const IMAGE: f64 = 2e-3;
+const SCENES: [&str; 3] = ["sunset", "sun", "turned"];
+const FRAMES: std::ops::RangeInclusive<i32> = 1..=8;
+
+/// The name of the device, or none where tests are told to do without or there is none; says which.
+fn device(folder: &Path) -> Option<String> {
+    let mode = std::env::var("SMOKE_GPU").unwrap_or_else(|_| "auto".into());
+    assert!(
+        ["off", "auto", "require"].contains(&mode.as_str()),
+        "SMOKE_GPU: found {mode}, expected off, auto, require"
+    );
+    let list: Value = serde_json::from_str(&answer(folder, &["devices", "--json"])).unwrap();
+    let name = list[0]["name"].as_str().filter(|_| mode != "off").map(str::to_owned);
+    assert!(name.is_some() || mode != "require", "SMOKE_GPU=require: no graphics device");
+    eprintln!("SMOKE_GPU={mode}: {}", name.as_deref().unwrap_or("0 GPU cases, no device is used"));
+    name
+}
+
+fn scene(name: &str) -> String {
+    format!("{}/testdata/scenes/{name}.toml", env!("CARGO_MANIFEST_DIR"))
+}
+
+fn bake(folder: &Path, pack: &str, frames: &str, more: &[&str]) {
+    let fit = ["--gaussians", "40", "--first-evaluations", "20", "--next-evaluations", "6", "--max-error", "0.004"];
+    let line = ["bake", PLUME, "-o", pack, "--frames", frames, "--progress", "none"];
+    answer(folder, &[&line[..], &fit, more].concat());
+}
+
+/// Renders to `DEVICE.####.exr`.
+fn render(folder: &Path, pack: &str, device: &str, scene: &str, more: &[&str]) {
+    let output = format!("{device}.####.exr");
+    let size = ["--width", "50", "--height", "60", "--float", "--progress", "none"];
+    let line = ["render", pack, "--device", device, "--scene", scene, "-o", &output];
+    answer(folder, &[&line[..], &size, more].concat());
+}
+
+/// RMSE of all channels but depth over the RMS of the first; infinite if any is not a number.
+fn difference(a: &FloatImage, b: &FloatImage) -> f64 {
+    let values = |image: &FloatImage| -> Vec<f64> {
+        let colour = image.channels.iter().filter(|channel| channel.name != "Z");
+        colour.flat_map(|channel| channel.values.iter().map(|&v| f64::from(v))).collect()
+    };
+    let (a, b) = (values(a), values(b));
+    assert_eq!(a.len(), b.len());
+    let size: f64 = a.iter().map(|v| v * v).sum();
+    let error: f64 = a.iter().zip(&b).map(|(a, b)| (a - b) * (a - b)).sum();
+    assert!(size > 0.0, "nothing to compare");
+    let relative = (error / size).sqrt();
+    if relative.is_finite() { relative } else { f64::INFINITY }
+}
+
+fn read(folder: &Path, device: &str, frame: i32) -> FloatImage {
+    image::read(&folder.join(format!("{device}.{frame:04}.exr"))).unwrap()
+}
+
+#[test]
+fn no_frame_of_a_sequence_is_left_out_or_comes_twice() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let Some(name) = device(folder) else { return };
+    bake(folder, "p.smoke", "1-8", &[]);
+    for device in ["cpu", "gpu"] {
+        render(folder, "p.smoke", device, &scene("sunset"), &[]);
+    }
+    for frame in FRAMES {
+        let found = read(folder, "gpu", frame);
+        for other in FRAMES {
+            let off = difference(&read(folder, "cpu", other), &found);
+            // Frames are further apart than devices: what is shown is this frame and no other.
+            assert!(if other == frame { off <= IMAGE } else { off > 5.0 * IMAGE }, "{frame} beside {other}: {off}");
+        }
+    }
+    eprintln!("{name}: {} GPU cases", FRAMES.count());
+}
+
+#[test]
+fn images_of_every_method_and_scene_agree_with_the_processors() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let Some(name) = device(folder) else { return };
+    let mut cases = 0;
+    for scene_name in SCENES {
+        let scene = scene(scene_name);
+        let transfer = ["--transfer", "hat162", "--clusters", "32", "--photons", "2", "--medium", &scene];
+        bake(folder, &format!("{scene_name}.smoke"), "6", &transfer);
+        let pack = format!("{scene_name}.smoke");
+        for method in [&["--method", "compensated"][..], &["--route", "centres"], &["--method", "transfer"]] {
+            for device in ["cpu", "gpu"] {
+                render(folder, &pack, device, &scene, method);
+            }
+            let off = difference(&read(folder, "cpu", 6), &read(folder, "gpu", 6));
+            eprintln!("{scene_name} {method:?}: {off:.1e}");
+            assert!(off <= IMAGE, "{scene_name} {method:?}: {off}");
+            cases += 1;
+        }
+    }
+    eprintln!("{name}: {cases} GPU cases");
+}
