@@ -343,6 +343,25 @@ mod tests {
     }
 
     #[test]
+    fn transfer_is_told_of_where_it_can_serve_and_never_chosen_however_good_it_is() {
+        let table = table(&[("default", 0.02, 0.5), ("transfer", 0.002, 0.01), ("reference", 0.01, 90.0)]);
+        let mut scene = survey(1.0, 0.9, 0.0);
+        for goal in [Goal::Best, Goal::Error(0.003), Goal::Error(0.05), Goal::Time(0.02), Goal::Time(1e3)] {
+            let plan = choose(&scene, goal, 1, &table);
+            assert_ne!(plan.candidate().rung.name, TRANSFER, "{goal:?}");
+            let outlook = plan.transfer.unwrap();
+            assert!((outlook.error / 0.002 - 1.0).abs() < 1e-6 && !outlook.is_baked && outlook.pays_from.is_some());
+        }
+        scene.transfer = Some(scene.medium.parameters);
+        assert!(choose(&scene, Goal::Best, 1, &table).transfer.unwrap().is_baked);
+        scene.medium.parameters.albedo[2] = 0.8;
+        assert_eq!(choose(&scene, Goal::Best, 1, &table).transfer, None);
+        scene.transfer = None;
+        scene.light.points = vec![0];
+        assert_eq!(choose(&scene, Goal::Best, 1, &table).transfer, None);
+    }
+
+    #[test]
     fn rungs_that_were_not_measured_are_never_chosen_for_an_error() {
         let plan = choose(&survey(1.0, 0.9, 0.0), Goal::Error(0.3), 1, &table(&[("default", 0.02, 0.5)]));
         assert_eq!(plan.candidate().rung.name, DEFAULT);

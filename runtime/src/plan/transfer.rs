@@ -4,9 +4,9 @@
 //! price of a march. All figures are for `bake --transfer dsf642` with its other defaults.
 //!
 //! - *error*: from the measured table, as that of every rung.
-//! - *change of light and view*: from the measured seconds of projection, sweeps and shading, see the constants.
-//! - *bytes*: counted, `k_e (128 c 5 x 642) + k_m (128 x 5 x 162 b^2)` halves for the clusters of `k_e` extinctions and `k_m`
-//!   media, b bands, and [`ROW_BYTES`] for each lit node and each cell.
+//! - *change of light and view*: measured seconds to project a sky, to sweep for a sun and to shade.
+//! - *bytes*: counted, as they lie in a pack: `128 x 5 x (642 e + 162 b^2 m)` half floats of clusters for e extinctions, m
+//!   pairs of extinction and albedo and b bands, and [`ROW_BYTES`] for each lit node and each cell.
 //! - *bake*: seconds a million voxels on two threads, measured over depth at two phase functions ([`BAKED`]).
 //!
 //! Cost: nothing is looked at but the survey's figures.
@@ -21,12 +21,13 @@ const BASES: f64 = 128.0 * 5.0;
 const DIRECTIONS: [f64; 2] = [642.0, 162.0];
 /// Bytes of a row in a pack: its cluster and four weights.
 const ROW_BYTES: f64 = 9.0;
-/// Rows a voxel with density: nodes with a dense neighbour (1.2), and cells of two voxels a side (0.17).
-const ROWS: [f64; 2] = [1.2, 0.17];
+/// Rows a voxel with density, of frames 3 and 6 of the shipped plume: nodes with a dense neighbour, and cells of two voxels
+/// a side.
+const ROWS: [f64; 2] = [1.16, 0.145];
 /// Seconds on one thread to light the clusters under an environment, isotropic and with four bands, and to sweep a node
 /// for a sun: `runtime/examples/transfer_speed.rs`.
-const ENVIRONMENT: [f64; 2] = [0.010, 0.016];
-const SUN_A_NODE: f64 = 6e-9;
+const ENVIRONMENT: [f64; 2] = [0.0096, 0.018];
+const SUN_A_NODE: f64 = 5.9e-9;
 /// Measured bakes of frame 6 of the shipped plume (`docs/decisions/050-transfer.md`): optical depth (95th percentile), and
 /// seconds a million voxels on two threads at g = 0 and g = 0.5.
 const BAKED: [(f64, [f64; 2]); 3] = [(0.15, [100.0, 150.0]), (0.9, [200.0, 300.0]), (6.0, [400.0, 600.0])];
@@ -121,4 +122,61 @@ fn bake_seconds(survey: &Survey) -> f64 {
     let ((from, low), (to, high)) = (at(next - 1), at(next));
     let part = ((depth - from) / (to - from)).clamp(0.0, 1.0);
     (low + (high - low) * part).exp()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::plan::tests::survey;
+
+    const PREDICTED: Prediction = Prediction { error: 0.01, seconds: [0.5, 0.02, 0.03] };
+
+    fn of(survey: &Survey, otherwise: f64, threads: usize) -> TransferOutlook {
+        TransferOutlook::of(survey, &PREDICTED, otherwise, threads)
+    }
+
+    #[test]
+    fn bytes_are_those_of_clusters_and_rows_and_channels_that_differ_have_their_own() {
+        let mut scene = survey(4.0, 0.9, 0.0);
+        scene.medium.voxels = 124_835;
+        // Frame 6 of the shipped plume: its pack has 144,302 nodes, 18,038 cells and 2,490,248 bytes of transfer.
+        let all = |scene: &Survey| of(scene, 1.0, 2).bytes_a_voxel * scene.medium.voxels as f64;
+        assert!((all(&scene) / 2_490_248.0 - 1.0).abs() < 0.01, "{}", all(&scene));
+        scene.medium.parameters.g = 0.5;
+        assert!((all(&scene) / 5_600_648.0 - 1.0).abs() < 0.01, "{}", all(&scene));
+        let seconds = of(&scene, 1.0, 2).bake_seconds;
+        scene.medium.parameters.albedo = [0.9, 0.8, 0.9];
+        assert!(all(&scene) > 1.5 * 5_600_648.0 && of(&scene, 1.0, 2).bake_seconds == 2.0 * seconds);
+        scene.medium.parameters.sigma_t = [4.0, 2.0, 1.0];
+        assert!((all(&scene) / (3.0 * 5_600_648.0) - 1.0).abs() < 0.01);
+        scene.medium.voxels = 0;
+        assert!(of(&scene, 1.0, 2).bytes_a_voxel.is_finite());
+    }
+
+    #[test]
+    fn a_bake_takes_longer_in_thicker_media_with_peaks_and_shorter_on_more_threads() {
+        let at = |sigma_t, g, threads| of(&survey(sigma_t, 0.9, g), 1.0, threads).bake_seconds_a_million;
+        assert!(at(0.5, 0.0, 2) < at(8.0, 0.0, 2) && at(8.0, 0.0, 2) < at(8.0, 0.5, 2));
+        assert!(at(8.0, 0.25, 2) > at(8.0, 0.0, 2) && at(8.0, 0.9, 2) == at(8.0, -0.5, 2));
+        assert!(at(8.0, 0.0, 4) < at(8.0, 0.0, 2) && at(1e9, 0.0, 2).is_finite() && at(0.0, 0.0, 2) > 0.0);
+        // At the measured places, what was measured.
+        for (depth, [even, strong]) in BAKED {
+            let mut scene = survey(1.0, 0.9, 0.0);
+            scene.medium.column_p95 = depth;
+            assert!((of(&scene, 1.0, 2).bake_seconds_a_million / even - 1.0).abs() < 1e-6);
+            scene.medium.parameters.g = PEAKED as f32;
+            assert!((of(&scene, 1.0, 2).bake_seconds_a_million / strong - 1.0).abs() < 1e-6);
+        }
+    }
+
+    #[test]
+    fn an_eye_costs_nothing_where_light_scatters_evenly_and_a_bake_pays_where_images_are_slower_otherwise() {
+        let (even, peaked) = (of(&survey(4.0, 0.9, 0.0), 1.0, 2), of(&survey(4.0, 0.9, 0.5), 1.0, 2));
+        assert_eq!((even.view_change, peaked.view_change, even.march), (0.0, 0.02, 0.03));
+        assert!(even.light_change > 0.02 && even.light_change < peaked.light_change);
+        let images = even.pays_from.unwrap() as f64;
+        assert!((images - even.bake_seconds / (1.0 - even.light_change - 0.03)).abs() <= 1.0);
+        let never = [0.0, even.light_change, f64::INFINITY].map(|seconds| of(&survey(4.0, 0.9, 0.0), seconds, 2));
+        assert!(never.iter().all(|outlook| outlook.pays_from.is_none()));
+    }
 }

@@ -206,6 +206,23 @@ impl<'a> Space<'a> {
         hit
     }
 
+    /// The next collision of `steps` on the piece of `ray` from `from` to `to`, or none, by the exact depth of its cells:
+    /// a fixed price where the density lies so far below its bound that tentative collisions would not end.
+    pub fn collision(&self, ray: &Ray, from: f64, to: f64, sigma_t: f32, steps: &mut Steps) -> Option<f64> {
+        let mut hit = None;
+        self.cells.walk(ray.origin, ray.direction, from, to, |from, to, _| {
+            let whole = integral(self, ray, from, to);
+            let depth = (f64::from(sigma_t) * whole) as f32;
+            if steps.0 < depth {
+                hit = Some(place_in(self, ray, from, to, f64::from(steps.0) / f64::from(sigma_t), whole));
+                return true;
+            }
+            steps.0 -= depth;
+            false
+        });
+        hit
+    }
+
     /// An estimate of the transmittance of each channel along `ray` up to `end` (world units; infinite for all the way).
     #[inline(always)]
     pub fn transmittance(&self, ray: &Ray, end: f64, extinction: &Extinction, random: &mut Random) -> Vec3 {
@@ -283,27 +300,30 @@ impl Column {
     pub fn place(&self, space: &Space, ray: &Ray, target: f64) -> f64 {
         let after = self.pieces.partition_point(|p| p.2 <= target).max(1);
         let Some(&(from, to, before)) = self.pieces.get(after - 1) else { return 0.0 };
-        let target = target - before;
         let end = self.pieces.get(after).map_or(self.total, |p| p.2);
-        // Newton's method on a rising cubic's integral, bisected where it would leave the bracket.
-        let (mut low, mut high) = (from, to);
-        let whole = end - before;
-        let mut t = if whole > 0.0 { from + (to - from) * (target / whole).clamp(0.0, 1.0) } else { from };
-        for _ in 0..60 {
-            let miss = integral(space, ray, from, t) - target;
-            if miss > 0.0 {
-                high = t
-            } else {
-                low = t
-            }
-            if miss.abs() <= 1e-7 * target || high - low <= 1e-15 * high {
-                break;
-            }
-            let newton = t - miss / f64::from(space.density(ray.at(t)));
-            t = if newton > low && newton < high { newton } else { 0.5 * (low + high) };
-        }
-        t
+        place_in(space, ray, from, to, target - before, end - before)
     }
+}
+
+/// Distance at which the density's integral from `from` on reaches `target`, on a piece of a ray that lies in one cell and
+/// whose integral is `whole`: Newton's method on a rising cubic's integral, bisected where it would leave the bracket.
+fn place_in(space: &Space, ray: &Ray, from: f64, to: f64, target: f64, whole: f64) -> f64 {
+    let (mut low, mut high) = (from, to);
+    let mut t = if whole > 0.0 { from + (to - from) * (target / whole).clamp(0.0, 1.0) } else { from };
+    for _ in 0..60 {
+        let miss = integral(space, ray, from, t) - target;
+        if miss > 0.0 {
+            high = t
+        } else {
+            low = t
+        }
+        if miss.abs() <= 1e-7 * target || high - low <= 1e-15 * high {
+            break;
+        }
+        let newton = t - miss / f64::from(space.density(ray.at(t)));
+        t = if newton > low && newton < high { newton } else { 0.5 * (low + high) };
+    }
+    t
 }
 
 /// Integral of the density over a piece of a ray that lies in one cell: exact, up to rounding.
