@@ -129,6 +129,20 @@ fn the_reference_ends_by_itself_at_a_depth_of_a_million_and_an_albedo_of_one() {
 }
 
 #[test]
+fn transfer_ends_by_itself_at_a_depth_of_a_million_and_an_albedo_of_one() {
+    // Photons walk for ever in such a medium: they are cut after 20,000 collisions, and that is told.
+    for (what, frame) in [("ball", ball(0.1, 1.0)), ("box", frame([12; 3], 0.1, 1.0, &[], |_| 1.0))] {
+        let mut scene = Scene { frame, ..Scene::lumps(grey(5e5, 1.0, 0.0), visible(white())) };
+        (scene.camera.width, scene.camera.height) = (6, 6);
+        let start = std::time::Instant::now();
+        let mean = light_in(&Method::Transfer.served(&scene)) / 108.0;
+        println!("{what}: transfer {mean:.4} in {:?}", start.elapsed());
+        // Cells of a depth of 1e5 are read as linear where light falls off within a voxel.
+        assert!((mean - 1.0).abs() < 0.3, "{what}: {mean}");
+    }
+}
+
+#[test]
 fn the_furnace_is_white_by_every_method_within_its_own_error() {
     let white_body = |frame, sigma_t, g| Scene { frame, ..Scene::lumps(grey(sigma_t, 1.0, g), visible(white())) };
     // Enough Gaussians that a centre is never far.

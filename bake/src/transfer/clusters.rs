@@ -301,6 +301,23 @@ mod tests {
     }
 
     #[test]
+    fn few_rows_have_the_directions_that_their_columns_have() {
+        // Seven rows of twelve numbers, of rank 6 about their mean; ten zeros more make the other matrix the smaller one.
+        let mut random = Random::new(5);
+        let rows: Vec<f32> = (0..7 * 12).map(|_| random.unit() - 0.5).collect();
+        let more = [&rows[..], &[0.0; 10 * 12]].concat();
+        let (few, many) = (principal(&rows, 12, 9), principal(&more, 12, 9));
+        for (t, (a, b)) in few.chunks_exact(12).zip(many.chunks_exact(12)).enumerate() {
+            let dot = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| f64::from(a * b)).sum::<f64>();
+            // The same up to sign, by sums in single precision; after the seventh there is none.
+            let expected = f64::from(u8::from(t < 7));
+            assert!((dot(a, b).abs() - expected).abs() < 1e-4, "{t}: {}", dot(a, b));
+            assert!((dot(a, a) - expected).abs() < 1e-5, "{t}");
+        }
+        assert_eq!(principal(&[0.0; 24], 12, 2), vec![0.0; 24]);
+    }
+
+    #[test]
     fn more_clusters_and_more_terms_leave_less() {
         let rows: Vec<f32> = planes(900, 16).iter().enumerate().map(|(i, v)| v + (i as f32 * 0.37).sin()).collect();
         let errors: Vec<f64> = [(1, 0), (4, 0), (4, 2), (16, 2), (16, 4)]

@@ -30,7 +30,7 @@ const ENVIRONMENT: [f64; 2] = [0.0096, 0.018];
 const SUN_A_NODE: f64 = 5.9e-9;
 /// Measured bakes of frame 6 of the shipped plume (`docs/decisions/050-transfer.md`): optical depth (95th percentile), and
 /// seconds a million voxels on two threads at g = 0 and g = 0.5.
-const BAKED: [(f64, [f64; 2]); 3] = [(0.15, [100.0, 150.0]), (0.9, [200.0, 300.0]), (6.0, [400.0, 600.0])];
+const BAKED: [(f64, [f64; 2]); 3] = [(1.51, [200.0, 270.0]), (9.08, [260.0, 340.0]), (60.5, [330.0, 430.0])];
 /// g at which the second of [`BAKED`] was measured.
 const PEAKED: f64 = 0.5;
 /// Threads of [`BAKED`].

@@ -334,3 +334,49 @@ fn integral(space: &Space, ray: &Ray, from: f64, to: f64) -> f64 {
     let other = space.density(ray.at(middle + GAUSS * length));
     0.5 * length * f64::from(one + other)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_collision_by_exact_depth_lies_where_the_column_reaches_that_depth() {
+        let n = 9;
+        let value = |v: usize| ((v * 7919 % 23) as f32 / 23.0 - 0.3).max(0.0) * 0.2f32.powi((v % n / 2) as i32);
+        let values: Vec<f32> = (0..n * n * n).map(value).collect();
+        let field = DensityField::from_box([0; 3], [n; 3], &values, DAffine3::from_scale(DVec3::new(0.5, 0.4, 0.6)));
+        let sigma_t = 5.0;
+        let space = Space::new(&field, sigma_t);
+        let (mut random, mut column, mut met) = (Random::new(3), Column::default(), 0);
+        for _ in 0..400 {
+            let way = Vec3::new(random.unit(), random.unit() - 0.5, random.unit() - 0.5).normalize();
+            let ray = space.ray(DVec3::new(0.5, 5.0, 4.5), way);
+            column.measure(&space, &ray);
+            let (near, far) = space.span(&ray).unwrap();
+            let mut steps = Steps::new(&mut random);
+            let depth = steps.0;
+            let hit = space.collision(&ray, near, far, sigma_t, &mut steps);
+            let left = f64::from(depth) - f64::from(sigma_t) * column.total;
+            // Depths are kept in single precision: 1e-6 of ten.
+            match hit {
+                Some(hit) => {
+                    let place = column.place(&space, &ray, f64::from(depth / sigma_t));
+                    let between = integral_between(&space, &ray, hit.min(place), hit.max(place));
+                    assert!(f64::from(sigma_t) * between < 1e-5 && left < 1e-5, "{hit} {place}");
+                    met += 1;
+                }
+                None => assert!(left > -1e-5 && (f64::from(steps.0) - left).abs() < 1e-5, "{left} {}", steps.0),
+            }
+        }
+        assert!(met > 100 && met < 390, "{met}");
+    }
+
+    fn integral_between(space: &Space, ray: &Ray, from: f64, to: f64) -> f64 {
+        let mut sum = 0.0;
+        space.cells.walk(ray.origin, ray.direction, from, to, |from, to, _| {
+            sum += integral(space, ray, from, to);
+            false
+        });
+        sum
+    }
+}
