@@ -135,7 +135,7 @@ fn transfer_ends_by_itself_at_a_depth_of_a_million_and_an_albedo_of_one() {
     let soft = |at: [u32; 3]| 0.1f32.powi(at[0] as i32);
     for (what, frame) in [("soft", frame([6; 3], 0.1, 1.0, &[], soft)), ("box", frame([6; 3], 0.1, 1.0, &[], |_| 1.0))]
     {
-        let mut scene = Scene { frame, ..Scene::lumps(grey(5e5, 1.0, 0.0), visible(white())) };
+        let mut scene = Scene { frame, ..Scene::lumps(grey(2e6, 1.0, 0.0), visible(white())) };
         (scene.camera.width, scene.camera.height) = (6, 6);
         let start = std::time::Instant::now();
         let mean = light_in(&Method::Transfer.served(&scene)) / 108.0;
