@@ -13,7 +13,7 @@ use smoke_runtime::film::Film;
 use smoke_runtime::light::Light;
 use smoke_runtime::medium::frame::Frame;
 use smoke_runtime::plan::choose::Settings;
-use smoke_runtime::renderer::{RenderSettings, Seconds};
+use smoke_runtime::renderer::{RenderSettings, Route, Seconds};
 use smoke_runtime::transport::reference::{ReferenceSettings, trace};
 use std::time::Instant;
 
@@ -92,6 +92,14 @@ impl Method {
             }
         };
         Ok((method, Some(plan.sentence())))
+    }
+
+    /// The method of these dials.
+    pub fn of(settings: RenderSettings) -> Self {
+        match settings.route {
+            Route::Transfer(_) => Self::Transfer(settings),
+            Route::Grid(_) | Route::Centres(_) => Self::Compensated(settings),
+        }
     }
 
     fn marched(args: &RenderArgs, base: RenderSettings) -> Result<Self, Failure> {

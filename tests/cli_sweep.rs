@@ -114,6 +114,43 @@ fn a_killed_sweep_continues_and_ends_with_the_same_rows() {
 }
 
 #[test]
+fn transfer_is_swept_beside_the_other_methods_and_left_out_of_frames_that_have_none() {
+    let folder = FOLDER.path();
+    let bake = ["--set", "gaussians=40", "--set", "first-evaluations=10", "--set", "clusters=32"];
+    let transfer = ["--set", "transfer=hat42", "--set", "medium=medium.toml", "--set", "photons=1"];
+    let dials = ["--dial", "method=compensated,transfer", "--dial", "clusters=1", "--json"];
+    std::fs::write(folder.join("medium.toml"), SCENE).unwrap();
+    let line = line(common::PLUME, "transfer", &[&bake[..], &transfer, &dials].concat());
+    let said = answer(folder, &line);
+    let json: Value = serde_json::from_str(&said).unwrap();
+    let rows = json["rows"].as_array().unwrap();
+    let of = |row: &Value| {
+        let [method, dial] = ["method", "dial"].map(|name| row[name].as_str().unwrap().to_owned());
+        (method.split(' ').next().unwrap_or_default().to_owned(), dial)
+    };
+    let expected =
+        [("compensated", "defaults"), ("transfer", "defaults"), ("compensated", "clusters"), ("transfer", "clusters")];
+    assert_eq!(rows.iter().map(of).collect::<Vec<_>>(), expected.map(|(a, b)| (a.to_owned(), b.to_owned())));
+    let error = |row: usize| rows[row]["relative_rmse"].as_f64().unwrap();
+    // The pack is the same to the fast method, whatever its transfer; one cluster of four terms keeps less than 32.
+    assert!(error(0) == error(2) && error(1) < 0.1 && error(3) > error(1), "{said}");
+    assert!(rows.iter().all(|row| row["seconds"]["source_radiance"].as_f64().unwrap() > 0.0));
+    let page = std::fs::read_to_string(folder.join("transfer/index.html")).unwrap();
+    assert!(page.contains(">transfer<") && page.matches("<img").count() == 1 + 2 * 4, "{page}");
+    // Another medium in the file is another pack, also where a sweep goes on.
+    std::fs::write(folder.join("medium.toml"), SCENE.replace("albedo = 0.9", "albedo = 0.8")).unwrap();
+    let resumed = [&line[..], &["--resume"]].concat();
+    let json: Value = serde_json::from_str(&answer(folder, &resumed)).unwrap();
+    let refused = json["refused"].to_string();
+    assert!(refused.contains("medium.albedo: found [0.9, 0.9, 0.9], expected [0.8"), "{refused}");
+
+    let dial = ["--dial", "method=compensated,transfer", "--json"];
+    let json: Value = serde_json::from_str(&answer(folder, &self::line("plume.smoke", "without", &dial))).unwrap();
+    let refused = json["refused"].to_string();
+    assert!(json["rows"].as_array().unwrap().len() == 1 && refused.contains("the frame has no transfer"), "{refused}");
+}
+
+#[test]
 fn what_cannot_be_swept_is_refused_before_anything_is_written() {
     let folder = FOLDER.path();
     let refused = |input: &str, more: &[&str]| refusal(folder, &line(input, "nothing", more));

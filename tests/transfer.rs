@@ -115,6 +115,35 @@ fn a_black_sky_gives_a_black_image_and_every_dial_another_one() {
 }
 
 #[test]
+fn plan_tells_what_a_bake_of_transfer_brings_whether_there_is_one_and_what_it_cannot_serve() {
+    let folder = BAKED.path();
+    let plan = |scene: &str, more: &[&str]| -> Value {
+        let line = ["plan", "plume.smoke", "--scene", scene, "--json"];
+        serde_json::from_str(&answer(folder, &[&line[..], more].concat())).unwrap()
+    };
+    let of = |json: &Value| {
+        let methods = json["methods"].as_array().unwrap();
+        methods.iter().find(|m| m["method"] == "transfer").unwrap()["why_not"].as_str().map(str::to_owned)
+    };
+    let baked = plan("sun.toml", &["--frames", "3"]);
+    assert_eq!((of(&baked), baked["transfer"]["baked"].as_bool()), (None, Some(true)));
+    assert_ne!(baked["choice"]["method"], "transfer");
+    for figure in ["error", "bytes_a_voxel", "bake_seconds", "bake_seconds_a_million_voxels"] {
+        assert!(baked["transfer"][figure].as_f64().unwrap() > 0.0, "{figure}");
+    }
+    let without = plan("sun.toml", &["--frames", "4", "--sigma-t", "9"]);
+    assert_eq!((of(&without), without["transfer"]["baked"].as_bool()), (None, Some(false)));
+    let other = plan("sun.toml", &["--frames", "3", "--sigma-t", "9"]);
+    assert!(of(&other).unwrap().contains("medium.sigma_t: found [9.0, 9.0, 9.0], expected [4.0"), "{other}");
+    assert!(of(&plan("point.toml", &[])).unwrap().contains("found a point") && other["transfer"].is_null());
+    let words = answer(folder, &["plan", "plume.smoke", "--scene", "sun.toml", "--frames", "3"]);
+    for expected in ["transfer, for one medium", "this frame has it", "change", "a million voxels", "images of a frame"]
+    {
+        assert!(words.contains(expected), "{expected}: {words}");
+    }
+}
+
+#[test]
 fn what_transfer_cannot_serve_is_refused_in_one_line() {
     let folder = BAKED.path();
     let line = |scene: &'static str, frame: &'static str| {

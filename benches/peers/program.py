@@ -50,6 +50,17 @@ class Program:
             self.run("bake", self.data / "plume" / "plume.####.vdb", "--frames", frame, "-o", path, "--progress", "none")
         return path
 
+    def transfer_pack(self, frame, sigma_t, albedo, g):
+        """The same with the light's transfer for a medium."""
+        path = self.work / f"plume_{frame}_transfer_{sigma_t}_{albedo}_{g}.smoke"
+        if not path.exists():
+            medium = path.with_suffix(".toml")
+            camera = "[camera]\nposition = [0, -1, 0]\ntarget = [0, 0, 0]\nfov = 30\n[image]\nwidth = 1\nheight = 1\n"
+            medium.write_text(f"{camera}[medium]\nsigma_t = {sigma_t}\nalbedo = {albedo}\ng = {g}\n")
+            self.run("bake", self.data / "plume" / "plume.####.vdb", "--frames", frame, "-o", path, "--progress", "none",
+                     "--transfer", "dsf642", "--medium", medium)
+        return path
+
     def density(self, frame):
         """The density of that pack, not of its source, as `grid_to_npz.py` leaves it."""
         path = self.work / f"plume_{frame}.npz"

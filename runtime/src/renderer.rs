@@ -365,7 +365,7 @@ pub(crate) fn check_box(dims: [usize; 3]) -> Result<(), RenderError> {
 }
 
 /// Refuses a medium that transfer was not baked for.
-fn check_medium(asked: &MediumParameters, baked: &MediumParameters) -> Result<(), RenderError> {
+pub(crate) fn check_medium(asked: &MediumParameters, baked: &MediumParameters) -> Result<(), RenderError> {
     let colours = |name, asked: [f32; 3], baked: [f32; 3]| match asked == baked {
         true => Ok(()),
         false => Err(RenderError::OtherMedium { name, found: format!("{asked:?}"), baked: format!("{baked:?}") }),

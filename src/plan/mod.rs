@@ -21,6 +21,7 @@ use smoke_runtime::plan::Survey;
 use smoke_runtime::plan::choose::{Goal, Plan, choose};
 use smoke_runtime::plan::over_time::{OverTime, sampled, thickest};
 use smoke_runtime::plan::table::MEASURED;
+use smoke_runtime::transport::medium::MediumParameters;
 use std::io::Read;
 use std::path::Path;
 
@@ -85,12 +86,18 @@ pub fn of_pack(
     let voxels: Vec<u64> = chosen.iter().map(|&position| pack.frames()[position].active_voxels).collect();
     // The first of equals.
     let largest = (0..voxels.len()).rev().max_by_key(|&i| voxels[i]);
+    let baked = pack.transfer();
     let mut looked_at = Vec::new();
     for at in sampled(chosen.len(), largest) {
         let position = chosen[at];
         let frame = Frame::read(pack, position)?;
         let fit_error = (!frame.gaussians.is_empty()).then(|| pack.frames()[position].fit_error);
-        looked_at.push((numbers[position], survey(&frame, stage, fit_error)));
+        let transfer = baked.filter(|_| pack.has_transfer(position)).map(|record| MediumParameters {
+            sigma_t: record.sigma_t,
+            albedo: record.albedo,
+            g: record.g,
+        });
+        looked_at.push((numbers[position], Survey { transfer, ..survey(&frame, stage, fit_error) }));
     }
     planned(pack.path(), chosen.len(), looked_at, &voxels, goal, threads)
 }

@@ -8,6 +8,7 @@ use smoke_runtime::plan::light_survey::LightSurvey;
 use smoke_runtime::plan::methods::METHODS;
 use smoke_runtime::plan::over_time::Range;
 use smoke_runtime::plan::terms::percent;
+use smoke_runtime::plan::transfer::TransferOutlook;
 use std::fmt::Write;
 use std::path::Path;
 
@@ -68,8 +69,35 @@ pub fn as_text(input: &Path, planned: &Planned) -> String {
         };
         let _ = writeln!(out, "{mark} {:<12} {error:>7} {seconds:>8}  {}", candidate.rung.name, candidate.rung.words);
     }
+    if let Some(outlook) = &plan.transfer {
+        out += &transfer(outlook, plan.candidate().rung.name);
+    }
     let _ = writeln!(out, "\nchoice: {}", plan.sentence());
     out
+}
+
+/// What a bake of transfer would bring, beside the rung `chosen`.
+fn transfer(outlook: &TransferOutlook, chosen: &str) -> String {
+    let milliseconds = |seconds: f64| format!("{} ms", number(1e3 * seconds));
+    let [light, view, march] = [outlook.light_change, outlook.view_change, outlook.march].map(milliseconds);
+    let bake =
+        if outlook.is_baked { "this frame has it" } else { "not baked: `bake --transfer dsf642 --medium SCENE`" };
+    let pays = match outlook.pays_from {
+        Some(images) => format!("from {images} images of a frame on, against {chosen}"),
+        None => format!("never: {chosen} is as fast"),
+    };
+    format!(
+        "\ntransfer, for one medium under changing light and camera: {bake}\n  \
+         error           {}\n  \
+         change          light {light}, view {view}; and {march} to march\n  \
+         size            {:.1} bytes a voxel\n  \
+         bake            {} s this frame, {} s a million voxels\n  \
+         pays            {pays}\n",
+        percent(outlook.error),
+        outlook.bytes_a_voxel,
+        number(outlook.bake_seconds),
+        number(outlook.bake_seconds_a_million),
+    )
 }
 
 /// The document of `--json`.
@@ -132,6 +160,19 @@ pub fn as_json(input: &Path, planned: &Planned) -> Value {
         "methods": methods,
         "terms": terms,
         "candidates": plan.candidates.iter().map(candidate).collect::<Vec<_>>(),
+        "transfer": plan.transfer.map(|outlook| json!({
+            "baked": outlook.is_baked,
+            "error": outlook.error,
+            "seconds": {
+                "light_change": outlook.light_change,
+                "view_change": outlook.view_change,
+                "march": outlook.march,
+            },
+            "bytes_a_voxel": outlook.bytes_a_voxel,
+            "bake_seconds": outlook.bake_seconds,
+            "bake_seconds_a_million_voxels": outlook.bake_seconds_a_million,
+            "pays_from_images": outlook.pays_from,
+        })),
         "goal": match plan.goal {
             Goal::Best => json!({}),
             Goal::Error(error) => json!({ "error": error }),

@@ -16,6 +16,7 @@ use smoke_runtime::image_difference::flip::flip;
 use smoke_runtime::image_difference::uncertainty::uncertainty;
 use smoke_runtime::image_difference::{self, Incomparable, Noise, Pair, false_colour};
 use smoke_runtime::medium::field::DensityField;
+use smoke_runtime::renderer::RenderError;
 use smoke_runtime::transport::reference::{ReferenceSettings, trace};
 use std::time::Instant;
 
@@ -80,6 +81,9 @@ pub fn render(
     stage: &Stage,
     repeat: u8,
 ) -> Result<Result<(Film, Seconds), String>, Failure> {
+    if matches!(method, Method::Transfer(_)) && !pack.has_transfer(position) {
+        return Ok(Err(RenderError::NoTransfer.to_string()));
+    }
     let mut runs: Vec<(Seconds, Film)> = Vec::new();
     for _ in 0..repeat.max(1) {
         let mut maker = match method.maker(stage, &Device::Cpu) {

@@ -279,7 +279,7 @@ impl Sweep<'_> {
         let pool = self.pools.get(asked.threads.unwrap_or(0))?;
         let threads = pool.current_num_threads();
         let rendered = match dials
-            .map_or_else(|| Method::choose(&asked, &setting.stage), |dials| Ok(Method::Compensated(dials)))
+            .map_or_else(|| Method::choose(&asked, &setting.stage), |dials| Ok(Method::of(dials)))
             .map_err(points::conflict)
         {
             Ok(method) => pool

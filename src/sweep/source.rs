@@ -8,6 +8,7 @@ use crate::failure::Failure;
 use crate::{bake, cli::BakeArgs};
 use smoke_baking::survey::{Survey, read_density, survey};
 use smoke_formats::pack::Pack;
+use smoke_formats::scene::Scene;
 use smoke_formats::sequence::{FrameSelection, Sequence, SequenceFrame};
 use smoke_runtime::medium::field::DensityField;
 use smoke_runtime::medium::frame::Frame;
@@ -101,7 +102,12 @@ impl Source {
             Self::Volumes { input, survey } => (input, survey),
         };
         let sources: Vec<String> = (0..survey.frames.len()).map(|i| self.identity(i)).collect();
-        let key = Key::of(&["pack", &sources.join(" "), &format!("{options:?}")]);
+        // The medium of transfer is in a file, which may have changed since.
+        let medium = match options.bake(input, Path::new("pack"), "1", false)?.medium {
+            Some(scene) => format!("{:?}", Scene::read(&scene)?.medium),
+            None => String::new(),
+        };
+        let key = Key::of(&["pack", &sources.join(" "), &format!("{options:?}"), &medium]);
         let path = store.pack(&key);
         if path.exists() {
             return Ok(Pack::open(&path)?);

@@ -44,7 +44,9 @@ fn one_bright_texel_is_a_sun_of_its_flux_to_every_method() {
             println!("texel ({column}, {row}): {method:?} {ratio:.4}");
             // The texel is 1.4 degrees wide, and the centres see the sky by 98 cells of some 20 degrees: where a texel
             // lies on the edge of two, all of it still falls into one.
-            assert!((ratio - 1.0).abs() < 0.02, "{method:?} ({column}, {row}): {ratio}");
+            // Transfer takes a texel as a lobe of its basis, here 35 degrees wide, and a sun as it is.
+            let most = if method == Method::Transfer { 0.03 } else { 0.02 };
+            assert!((ratio - 1.0).abs() < most, "{method:?} ({column}, {row}): {ratio}");
         }
     }
 }

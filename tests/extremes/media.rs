@@ -24,6 +24,8 @@ fn model_error(method: Method, sigma_t: f32) -> f64 {
         Method::Grid | Method::HalfResolution => 0.08,
         // At g = 0.99 the peak is windowed to four bands: 8.6 % against 64 passes.
         Method::GridSingle => 0.10,
+        // One photon a face, 42 directions: up to 5.9 %.
+        Method::Transfer => 0.09,
         _ if sigma_t <= 0.1 => 0.05,
         Method::Centres => {
             if sigma_t < 5.0 {
@@ -128,6 +130,22 @@ fn the_reference_ends_by_itself_at_a_depth_of_a_million_and_an_albedo_of_one() {
 }
 
 #[test]
+fn transfer_ends_by_itself_at_a_depth_of_a_million_and_an_albedo_of_one() {
+    // Photons walk for ever in such a medium: they are cut after 20,000 collisions, and that is told.
+    let soft = |at: [u32; 3]| 0.1f32.powi(at[0] as i32);
+    for (what, frame) in [("soft", frame([6; 3], 0.1, 1.0, &[], soft)), ("box", frame([6; 3], 0.1, 1.0, &[], |_| 1.0))]
+    {
+        let mut scene = Scene { frame, ..Scene::lumps(grey(2e6, 1.0, 0.0), visible(white())) };
+        (scene.camera.width, scene.camera.height) = (6, 6);
+        let start = std::time::Instant::now();
+        let mean = light_in(&Method::Transfer.served(&scene)) / 108.0;
+        println!("{what}: transfer {mean:.4} in {:?}", start.elapsed());
+        // Cells of a depth of 1e5 are read as linear where light falls off within a voxel.
+        assert!((mean - 1.0).abs() < 0.3, "{what}: {mean}");
+    }
+}
+
+#[test]
 fn the_furnace_is_white_by_every_method_within_its_own_error() {
     let white_body = |frame, sigma_t, g| Scene { frame, ..Scene::lumps(grey(sigma_t, 1.0, g), visible(white())) };
     // Enough Gaussians that a centre is never far.
@@ -157,6 +175,14 @@ fn the_furnace_is_white_by_every_method_within_its_own_error() {
                 Method::Grid | Method::HalfResolution => 0.06,
                 // A furnace is what the centres' integral transport is made to keep.
                 Method::Centres => 0.02,
+                // Noise of one photon a face, pixel by pixel; and four bands of a peak that is narrower than the mesh.
+                Method::Transfer => {
+                    if g.abs() > 0.9 {
+                        0.38
+                    } else {
+                        0.21
+                    }
+                }
                 // The paper's diffusion does not keep it.
                 _ => 1.01,
             };

@@ -1,6 +1,8 @@
 //! The methods, the scenes they are driven through, and how images are held against the truth.
 
 use glam::{DAffine3, DQuat, DVec3, Vec3};
+use smoke_baking::transfer::at_rest::frame_transfer;
+use smoke_baking::transfer::{TransferSettings, bake_run};
 use smoke_formats::gaussian::{Gaussian, UnitSpace};
 use smoke_formats::residual::ResidualCodes;
 use smoke_formats::volume::VoxelMask;
@@ -10,13 +12,18 @@ use smoke_runtime::image_difference::debiased::debiased;
 use smoke_runtime::image_difference::{Noise, Pair};
 use smoke_runtime::light::{Environment, Light};
 use smoke_runtime::march::MarchSettings;
+use smoke_runtime::medium::field::DensityField;
 use smoke_runtime::medium::frame::Frame;
 use smoke_runtime::renderer::{RenderError, RenderSettings, Renderer, Route};
+use smoke_runtime::sphere::light_basis::{BasisKind, LightBasis};
 use smoke_runtime::transport::ScatteringOrder;
 use smoke_runtime::transport::compensated::centres::exponential::Exponential;
 use smoke_runtime::transport::compensated::centres::route::{CentreSettings, MultipleScattering};
 use smoke_runtime::transport::medium::MediumParameters;
 use smoke_runtime::transport::reference::{Estimate, ReferenceSettings, trace};
+use smoke_runtime::transport::transfer::frame::FrameTransfer;
+use smoke_runtime::transport::transfer::source::TransferSettings as TransferDials;
+use std::sync::{Arc, LazyLock};
 
 /// Every way to an image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -28,11 +35,20 @@ pub enum Method {
     Centres,
     /// Centres: optimal-linear exponential, diffusion; the paper's own pair.
     Paper,
+    /// Baked for each scene, with 42 directions and one photon a face.
+    Transfer,
     Reference,
 }
 
-pub const ALL: [Method; 6] =
-    [Method::Grid, Method::GridSingle, Method::HalfResolution, Method::Centres, Method::Paper, Method::Reference];
+pub const ALL: [Method; 7] = [
+    Method::Grid,
+    Method::GridSingle,
+    Method::HalfResolution,
+    Method::Centres,
+    Method::Paper,
+    Method::Transfer,
+    Method::Reference,
+];
 
 /// All that an image depends on.
 #[derive(Clone)]
@@ -55,6 +71,7 @@ impl Method {
             }
             Self::Centres => centres(Exponential::Direct, MultipleScattering::IntegralCentres),
             Self::Paper => centres(Exponential::OptimalLinear, MultipleScattering::Diffusion),
+            Self::Transfer => RenderSettings { route: Route::Transfer(TransferDials::default()), ..plain },
             Self::Reference => return None,
         })
     }
@@ -76,7 +93,11 @@ impl Method {
             Some(settings) => {
                 let render = || -> Result<Film, RenderError> {
                     let mut renderer = Renderer::new(settings, scene.medium, scene.lights.clone())?;
-                    renderer.set_frame(scene.frame.clone())?;
+                    let mut frame = scene.frame.clone();
+                    if self == Self::Transfer {
+                        frame.transfer = Some(Arc::new(transfer(&frame.field, scene.medium)));
+                    }
+                    renderer.set_frame(frame)?;
                     Ok(renderer.render(&scene.camera)?.0)
                 };
                 render().map_err(|e| e.to_string())?
@@ -108,6 +129,20 @@ fn sound(film: &Film) -> Result<(), String> {
 pub fn centres(exponential: Exponential, multiple: MultipleScattering) -> RenderSettings {
     let route = Route::Centres(CentreSettings { exponential, multiple, ..CentreSettings::default() });
     RenderSettings { route, ..RenderSettings::default() }
+}
+
+/// Directions of light, and those of indirect light.
+static BASES: LazyLock<[Arc<LightBasis>; 2]> = LazyLock::new(|| {
+    let basis = BasisKind::Discrete(42);
+    [basis, basis.coarser()].map(|kind| Arc::new(LightBasis::new(kind)))
+});
+
+/// The transfer of a frame as a pack would give it.
+fn transfer(field: &DensityField, medium: MediumParameters) -> FrameTransfer {
+    let (clusters, terms, photons, shift, seed, memory) = (32, 4, 1, 1, 1, 1 << 30);
+    let settings = TransferSettings { basis: BASES[0].kind(), medium, clusters, terms, photons, shift, seed, memory };
+    let run = bake_run(&[field], [&BASES[0], &BASES[1]], &settings, &|_, _, _| ());
+    frame_transfer(&run, &settings, &BASES, 0)
 }
 
 impl Scene {

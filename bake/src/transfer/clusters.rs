@@ -109,6 +109,40 @@ fn seeds(rows: &[f32], length: usize, weights: &[f32], count: usize, seed: u64) 
     out
 }
 
+/// The `terms` directions that hold most of `rows` (`[n][length]`), `[term][length]`; zeros where there are fewer. From the
+/// smaller of the two matrices: rows by rows has the same eigenvalues, and `V = X^T U / sqrt(lambda)`.
+fn principal(rows: &[f32], length: usize, terms: usize) -> Vec<f32> {
+    let n = rows.len() / length;
+    let side = n.min(length);
+    let transposed: Vec<f32>;
+    let (of, across) = if n < length {
+        transposed = (0..rows.len()).map(|at| rows[at % n * length + at / n]).collect();
+        (&transposed[..], n)
+    } else {
+        (rows, length)
+    };
+    let (values, vectors) = eigenvectors(&gram(of, across), side);
+    let mut out = Vec::with_capacity(terms * length);
+    for t in 0..terms.min(side) {
+        let vector = &vectors[t * side..][..side];
+        if !(values[t] > values[0] * 1e-10 && values[t] > 0.0) {
+            break;
+        }
+        if n < length {
+            let mut direction = vec![0.0f64; length];
+            for (row, u) in rows.chunks_exact(length).zip(vector) {
+                direction.iter_mut().zip(row).for_each(|(d, v)| *d += u * f64::from(*v));
+            }
+            let norm = direction.iter().map(|d| d * d).sum::<f64>().sqrt();
+            out.extend(direction.iter().map(|d| (d / norm) as f32));
+        } else {
+            out.extend(vector.iter().map(|&v| v as f32));
+        }
+    }
+    out.resize(terms * length, 0.0);
+    out
+}
+
 struct Bases {
     length: usize,
     terms: usize,
@@ -155,12 +189,7 @@ impl Bases {
                         rows[row * length..][..length].iter().zip(&mean).map(move |(v, m)| (v - m) * weight)
                     })
                     .collect();
-                let (values, vectors) = eigenvectors(&gram(&centred, length), length);
-                let least = values[0] * 1e-10;
-                for t in 0..terms.min(length) {
-                    let there = values[t] > least && values[t] > 0.0;
-                    out.extend(vectors[t * length..][..length].iter().map(|&v| if there { v as f32 } else { 0.0 }));
-                }
+                out.extend(principal(&centred, length, terms));
             }
             out.resize((1 + terms) * length, 0.0);
             out
@@ -269,6 +298,23 @@ mod tests {
         // f32 throughout, numbers up to 6.
         assert!(error(&rows, 20, &found) < 1e-5, "{}", error(&rows, 20, &found));
         assert!((0..600).all(|i| found.ids[i] == found.ids[i % 3]));
+    }
+
+    #[test]
+    fn few_rows_have_the_directions_that_their_columns_have() {
+        // Seven rows of twelve numbers, of rank 6 about their mean; ten zeros more make the other matrix the smaller one.
+        let mut random = Random::new(5);
+        let rows: Vec<f32> = (0..7 * 12).map(|_| random.unit() - 0.5).collect();
+        let more = [&rows[..], &[0.0; 10 * 12]].concat();
+        let (few, many) = (principal(&rows, 12, 9), principal(&more, 12, 9));
+        for (t, (a, b)) in few.chunks_exact(12).zip(many.chunks_exact(12)).enumerate() {
+            let dot = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| f64::from(a * b)).sum::<f64>();
+            // The same up to sign, by sums in single precision; after the seventh there is none.
+            let expected = f64::from(u8::from(t < 7));
+            assert!((dot(a, b).abs() - expected).abs() < 1e-4, "{t}: {}", dot(a, b));
+            assert!((dot(a, a) - expected).abs() < 1e-5, "{t}");
+        }
+        assert_eq!(principal(&[0.0; 24], 12, 2), vec![0.0; 24]);
     }
 
     #[test]

@@ -53,6 +53,11 @@ impl PackTransfer {
 }
 
 impl Pack {
+    /// Whether frame `frame` (counted from 0) has transfer.
+    pub fn has_transfer(&self, frame: usize) -> bool {
+        self.transfer_of(frame).is_ok()
+    }
+
     /// The bases of transfer of the run that frame `frame` (counted from 0) belongs to; fails if it has no transfer.
     /// They are kept until those of another run are asked for.
     pub fn transfer_bases(&self, frame: usize) -> Result<Arc<TransferBases>> {

@@ -5,13 +5,15 @@
 //! reference is traced until its noise does. A time is met if the predicted seconds are below it; of the rungs that meet
 //! it, the reference among them, the one of least error is taken. If neither is asked, it is the default rung, and the
 //! reference only where nothing else can serve.
+//! Baked transfer is told of, and never chosen: whether it pays to bake is not for one image to say ([`TransferOutlook`]).
 //! Seconds come from the table and the given count of threads, never from a clock: the same call makes the same choice.
 
 use super::Survey;
-use super::ladder::{DEFAULT, REFERENCE, Rung, ladder};
+use super::ladder::{DEFAULT, REFERENCE, Rung, TRANSFER, ladder};
 use super::methods::refusal;
 use super::table::{Prediction, Table};
 use super::terms::{NOTHING, Term, multiple_over_single, percent, terms};
+use super::transfer::TransferOutlook;
 use crate::renderer::{RenderError, RenderSettings, Route};
 use crate::transport::ScatteringOrder;
 
@@ -93,6 +95,8 @@ pub struct Plan {
     pub why: String,
     /// The terms that it leaves out and those that it keeps.
     pub terms: Vec<Term>,
+    /// What a bake of transfer costs and brings, if transfer can serve.
+    pub transfer: Option<TransferOutlook>,
 }
 
 impl Plan {
@@ -141,7 +145,10 @@ pub fn choose(survey: &Survey, goal: Goal, threads: usize, table: &Table) -> Pla
     };
     let single = candidates.iter().find(|c| c.rung.name == "single").and_then(|c| c.prediction);
     let terms = terms(survey, &rung, single.map(|p| p.error));
-    Plan { goal, candidates, chosen, settings, why, terms }
+    let transfer = candidates[position(&candidates, TRANSFER)]
+        .prediction
+        .map(|predicted| TransferOutlook::of(survey, &predicted, candidates[chosen].seconds(), threads));
+    Plan { goal, candidates, chosen, settings, why, terms, transfer }
 }
 
 /// The reference at the error that is asked, or at the one it reaches in the time: its seconds go as error^-2.
@@ -198,7 +205,7 @@ fn margin(survey: &Survey, rung: &Rung) -> f64 {
 }
 
 fn for_error(survey: &Survey, candidates: &[Candidate], error: f64) -> (usize, String) {
-    let fast = |i: &usize| candidates[*i].rung.settings.is_some();
+    let fast = |i: &usize| candidates[*i].rung.is_fast();
     let meets = |i: &usize| candidates[*i].error() * margin(survey, &candidates[*i].rung) <= error;
     let by_seconds = |a: &usize, b: &usize| candidates[*a].seconds().total_cmp(&candidates[*b].seconds());
     let cheapest = (0..candidates.len()).filter(fast).filter(meets).min_by(by_seconds);
@@ -224,14 +231,14 @@ fn for_error(survey: &Survey, candidates: &[Candidate], error: f64) -> (usize, S
 }
 
 fn for_time(candidates: &[Candidate], seconds: f64) -> (usize, String) {
-    let serves = |i: &usize| candidates[*i].prediction.is_some();
+    let serves = |i: &usize| candidates[*i].prediction.is_some() && candidates[*i].rung.name != TRANSFER;
     let fits = |i: &usize| candidates[*i].seconds() <= seconds * (1.0 + 1e-9);
     let order = |a: f64, b: f64, c: f64, d: f64| a.total_cmp(&b).then(c.total_cmp(&d));
     let by_error = |a: &usize, b: &usize| {
         let (a, b) = (&candidates[*a], &candidates[*b]);
         order(a.error(), b.error(), a.seconds(), b.seconds())
     };
-    let fast = |i: &usize| candidates[*i].rung.settings.is_some();
+    let fast = |i: &usize| candidates[*i].rung.is_fast();
     let by_seconds = |a: &usize, b: &usize| candidates[*a].seconds().total_cmp(&candidates[*b].seconds());
     if let Some(best) = (0..candidates.len()).filter(serves).filter(fits).min_by(by_error) {
         let predicted = candidates[best].seconds();
@@ -333,6 +340,25 @@ mod tests {
         let plan = choose(&scene, Goal::Best, 1, &four());
         assert!(plan.why.contains("light[0]: found a point"), "{}", plan.why);
         assert_eq!(plan.settings, Settings::Reference { target_error: REFERENCE_ERROR });
+    }
+
+    #[test]
+    fn transfer_is_told_of_where_it_can_serve_and_never_chosen_however_good_it_is() {
+        let table = table(&[("default", 0.02, 0.5), ("transfer", 0.002, 0.01), ("reference", 0.01, 90.0)]);
+        let mut scene = survey(1.0, 0.9, 0.0);
+        for goal in [Goal::Best, Goal::Error(0.003), Goal::Error(0.05), Goal::Time(0.02), Goal::Time(1e3)] {
+            let plan = choose(&scene, goal, 1, &table);
+            assert_ne!(plan.candidate().rung.name, TRANSFER, "{goal:?}");
+            let outlook = plan.transfer.unwrap();
+            assert!((outlook.error / 0.002 - 1.0).abs() < 1e-6 && !outlook.is_baked && outlook.pays_from.is_some());
+        }
+        scene.transfer = Some(scene.medium.parameters);
+        assert!(choose(&scene, Goal::Best, 1, &table).transfer.unwrap().is_baked);
+        scene.medium.parameters.albedo[2] = 0.8;
+        assert_eq!(choose(&scene, Goal::Best, 1, &table).transfer, None);
+        scene.transfer = None;
+        scene.light.points = vec![0];
+        assert_eq!(choose(&scene, Goal::Best, 1, &table).transfer, None);
     }
 
     #[test]

@@ -7,6 +7,7 @@ use crate::renderer::{RenderSettings, Route};
 use crate::transport::ScatteringOrder;
 use crate::transport::compensated::centres::route::CentreSettings;
 use crate::transport::compensated::grid::route::{GridSettings, least_multiple_step};
+use crate::transport::transfer::source::TransferSettings;
 
 /// One step of the ladder.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -21,6 +22,8 @@ pub struct Rung {
 
 /// The rung that `render` takes when nothing is asked.
 pub const DEFAULT: &str = "default";
+/// The rung of baked transfer.
+pub const TRANSFER: &str = "transfer";
 /// The rung that serves everything.
 pub const REFERENCE: &str = "reference";
 
@@ -48,6 +51,11 @@ impl Rung {
         Some(settings)
     }
 
+    /// True if `render` can go this way from the density alone: with dials, and without a bake of transfer.
+    pub fn is_fast(&self) -> bool {
+        self.settings.is_some_and(|s| !matches!(s.route, Route::Transfer(_)))
+    }
+
     /// True if light scattered once is all that it has.
     pub fn is_single(&self) -> bool {
         self.settings.is_some_and(|s| s.scattering == ScatteringOrder::Single)
@@ -55,7 +63,7 @@ impl Rung {
 }
 
 /// All rungs; those of the grid from coarse to fine, then the other methods'.
-pub fn ladder() -> [Rung; 10] {
+pub fn ladder() -> [Rung; 11] {
     let base = RenderSettings::default();
     let grid = GridSettings::default();
     let rung = |name, words, settings| Rung { name, words, settings: Some(settings) };
@@ -115,6 +123,11 @@ pub fn ladder() -> [Rung; 10] {
             "at the Gaussians' centres: direct exponential, integral transport",
             RenderSettings { route: Route::Centres(CentreSettings::default()), ..base },
         ),
+        rung(
+            TRANSFER,
+            "baked for this medium with dsf642 and the other defaults of `bake --transfer`",
+            RenderSettings { route: Route::Transfer(TransferSettings::default()), ..base },
+        ),
         Rung { name: REFERENCE, words: "unbiased path tracing until its noise is below the error", settings: None },
     ]
 }
@@ -137,6 +150,9 @@ mod tests {
         assert_eq!(rung(DEFAULT).unwrap().settings, Some(RenderSettings::default()));
         assert_eq!(rung(REFERENCE).unwrap().method(), "reference");
         assert_eq!(rung("centres").unwrap().method(), "centres");
+        assert_eq!(rung(TRANSFER).unwrap().method(), "transfer");
+        let fast: Vec<&str> = all.iter().filter(|rung| !rung.is_fast()).map(|rung| rung.name).collect();
+        assert_eq!(fast, [TRANSFER, REFERENCE]);
         let mut large = crate::plan::tests::survey(1.0, 0.9, 0.0);
         let step = |survey: &Survey| match rung("fine").unwrap().settings_for(survey).unwrap().route {
             Route::Grid(grid) => grid.multiple_step,

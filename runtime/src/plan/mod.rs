@@ -5,7 +5,8 @@
 //! 2. [`methods`] says who can serve, [`ladder`] has their settings from coarse to fine, [`terms`] says what can be left
 //!    out.
 //! 3. [`table`] predicts error and seconds of every rung from measurements ([`work`] scales the seconds).
-//! 4. [`choose`] takes the cheapest rung that meets an error, or the best that fits a time.
+//! 4. [`mod@transfer`] says what a bake of the light's transfer costs and brings.
+//! 5. [`choose`] takes the cheapest rung that meets an error, or the best that fits a time.
 //!
 //! Nothing here looks at a clock or at the machine: the same scene, goal and count of threads give the same plan.
 
@@ -17,6 +18,7 @@ pub mod methods;
 pub mod over_time;
 pub mod table;
 pub mod terms;
+pub mod transfer;
 pub mod view_survey;
 pub mod work;
 
@@ -39,6 +41,8 @@ pub struct Survey {
     pub view: ViewSurvey,
     /// Fit error of the frame's Gaussians, sum (D - fit)^2 / sum D^2, if it has any.
     pub fit_error: Option<f64>,
+    /// The medium that the frame's transfer was baked for, if it has any.
+    pub transfer: Option<MediumParameters>,
 }
 
 impl Survey {
@@ -52,7 +56,8 @@ impl Survey {
     ) -> Self {
         let light = LightSurvey::of(lights);
         let view = ViewSurvey::of(frame, parameters, lights, &light, camera);
-        Self { medium: MediumSurvey::of(frame, parameters), light, view, fit_error }
+        let transfer = frame.transfer.as_ref().map(|transfer| transfer.medium);
+        Self { medium: MediumSurvey::of(frame, parameters), light, view, fit_error, transfer }
     }
 }
 

@@ -251,7 +251,7 @@ impl Measured {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::plan::ladder::ladder;
+    use crate::plan::ladder::{TRANSFER, ladder};
     use crate::plan::tests::survey;
 
     /// A table over 2 x 2 x 1 x 2 scenes: error = 0.01 depth (1 + g), seconds = work * 1e-6.
@@ -342,7 +342,10 @@ mod tests {
         let table = Table::parse(include_str!("measured.csv")).unwrap();
         for rung in ladder() {
             let axes = table.0.get(rung.name).map(|measured| &measured.axes);
-            assert!(axes.is_some_and(|axes| axes.iter().all(|axis| axis.len() >= 2)), "{}", rung.name);
+            // Transfer was measured at one albedo: its error hardly depends on it, and each is a bake.
+            let least = |axis: usize| if rung.name == TRANSFER && axis == 2 { 1 } else { 2 };
+            let whole = |axes: &[Vec<f64>; 4]| (0..4).all(|axis| axes[axis].len() >= least(axis));
+            assert!(axes.is_some_and(whole), "{}", rung.name);
         }
     }
 }

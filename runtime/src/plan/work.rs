@@ -1,10 +1,10 @@
 //! How much each stage of a rung has to do, in units that its seconds are proportional to.
 //!
-//! | stage | grid | centres | reference |
-//! |---|---|---|---|
-//! | source radiance | `n_1 B + n_m (B + 2 rings^2 K)` | `G^1.4` | 0 |
-//! | volume pass | nodes | `nodes G^0.6` | 0 |
-//! | view pass | `pixels (1 + voxels a ray / step) samples^2` | the same | pixels that see smoke |
+//! | stage | grid | centres | transfer | reference |
+//! |---|---|---|---|---|
+//! | source radiance | `n_1 B + n_m (B + 2 rings^2 K)` | `G^1.4` | nodes | 0 |
+//! | volume pass | nodes | `nodes G^0.6` | nodes | 0 |
+//! | view pass | `pixels (1 + voxels a ray / step) samples^2` | the same | the same | pixels that see smoke |
 //!
 //! `n_1`, `n_m`: nodes of single and of multiple scattering; `B`: beams; `K` = [`PRODUCTS`] of the iteration; `G`:
 //! Gaussians, with the exponents of `docs/speed.md`. What else the seconds depend on (bands, thickness, iterations) is the
@@ -46,8 +46,8 @@ fn compensated(settings: &RenderSettings, survey: &Survey) -> [f64; 3] {
             };
             (single + multiple, all_nodes)
         }
-        // Lights clusters, not nodes; no rung uses it, as a pack may be without.
-        Route::Transfer(_) => (0.0, all_nodes),
+        // To light the clusters is a part of it, and the sweep of a sun and what a frame takes to be taken up another.
+        Route::Transfer(_) => (all_nodes, all_nodes),
         Route::Centres(_) => {
             let gaussians = medium.gaussians.map_or(0.0, |g| g.count as f64);
             (gaussians.powf(1.4), all_nodes * gaussians.powf(0.6))

@@ -206,6 +206,23 @@ impl<'a> Space<'a> {
         hit
     }
 
+    /// The next collision of `steps` on the piece of `ray` from `from` to `to`, or none, by the exact depth of its cells:
+    /// a fixed price where the density lies so far below its bound that tentative collisions would not end.
+    pub fn collision(&self, ray: &Ray, from: f64, to: f64, sigma_t: f32, steps: &mut Steps) -> Option<f64> {
+        let mut hit = None;
+        self.cells.walk(ray.origin, ray.direction, from, to, |from, to, _| {
+            let whole = integral(self, ray, from, to);
+            let depth = (f64::from(sigma_t) * whole) as f32;
+            if steps.0 < depth {
+                hit = Some(place_in(self, ray, from, to, f64::from(steps.0) / f64::from(sigma_t), whole));
+                return true;
+            }
+            steps.0 -= depth;
+            false
+        });
+        hit
+    }
+
     /// An estimate of the transmittance of each channel along `ray` up to `end` (world units; infinite for all the way).
     #[inline(always)]
     pub fn transmittance(&self, ray: &Ray, end: f64, extinction: &Extinction, random: &mut Random) -> Vec3 {
@@ -283,27 +300,30 @@ impl Column {
     pub fn place(&self, space: &Space, ray: &Ray, target: f64) -> f64 {
         let after = self.pieces.partition_point(|p| p.2 <= target).max(1);
         let Some(&(from, to, before)) = self.pieces.get(after - 1) else { return 0.0 };
-        let target = target - before;
         let end = self.pieces.get(after).map_or(self.total, |p| p.2);
-        // Newton's method on a rising cubic's integral, bisected where it would leave the bracket.
-        let (mut low, mut high) = (from, to);
-        let whole = end - before;
-        let mut t = if whole > 0.0 { from + (to - from) * (target / whole).clamp(0.0, 1.0) } else { from };
-        for _ in 0..60 {
-            let miss = integral(space, ray, from, t) - target;
-            if miss > 0.0 {
-                high = t
-            } else {
-                low = t
-            }
-            if miss.abs() <= 1e-7 * target || high - low <= 1e-15 * high {
-                break;
-            }
-            let newton = t - miss / f64::from(space.density(ray.at(t)));
-            t = if newton > low && newton < high { newton } else { 0.5 * (low + high) };
-        }
-        t
+        place_in(space, ray, from, to, target - before, end - before)
     }
+}
+
+/// Distance at which the density's integral from `from` on reaches `target`, on a piece of a ray that lies in one cell and
+/// whose integral is `whole`: Newton's method on a rising cubic's integral, bisected where it would leave the bracket.
+fn place_in(space: &Space, ray: &Ray, from: f64, to: f64, target: f64, whole: f64) -> f64 {
+    let (mut low, mut high) = (from, to);
+    let mut t = if whole > 0.0 { from + (to - from) * (target / whole).clamp(0.0, 1.0) } else { from };
+    for _ in 0..60 {
+        let miss = integral(space, ray, from, t) - target;
+        if miss > 0.0 {
+            high = t
+        } else {
+            low = t
+        }
+        if miss.abs() <= 1e-7 * target || high - low <= 1e-15 * high {
+            break;
+        }
+        let newton = t - miss / f64::from(space.density(ray.at(t)));
+        t = if newton > low && newton < high { newton } else { 0.5 * (low + high) };
+    }
+    t
 }
 
 /// Integral of the density over a piece of a ray that lies in one cell: exact, up to rounding.
@@ -313,4 +333,50 @@ fn integral(space: &Space, ray: &Ray, from: f64, to: f64) -> f64 {
     let one = space.density(ray.at(middle - GAUSS * length));
     let other = space.density(ray.at(middle + GAUSS * length));
     0.5 * length * f64::from(one + other)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_collision_by_exact_depth_lies_where_the_column_reaches_that_depth() {
+        let n = 9;
+        let value = |v: usize| ((v * 7919 % 23) as f32 / 23.0 - 0.3).max(0.0) * 0.2f32.powi((v % n / 2) as i32);
+        let values: Vec<f32> = (0..n * n * n).map(value).collect();
+        let field = DensityField::from_box([0; 3], [n; 3], &values, DAffine3::from_scale(DVec3::new(0.5, 0.4, 0.6)));
+        let sigma_t = 5.0;
+        let space = Space::new(&field, sigma_t);
+        let (mut random, mut column, mut met) = (Random::new(3), Column::default(), 0);
+        for _ in 0..400 {
+            let way = Vec3::new(random.unit(), random.unit() - 0.5, random.unit() - 0.5).normalize();
+            let ray = space.ray(DVec3::new(0.5, 5.0, 4.5), way);
+            column.measure(&space, &ray);
+            let (near, far) = space.span(&ray).unwrap();
+            let mut steps = Steps::new(&mut random);
+            let depth = steps.0;
+            let hit = space.collision(&ray, near, far, sigma_t, &mut steps);
+            let left = f64::from(depth) - f64::from(sigma_t) * column.total;
+            // Depths are kept in single precision: 1e-6 of ten.
+            match hit {
+                Some(hit) => {
+                    let place = column.place(&space, &ray, f64::from(depth / sigma_t));
+                    let between = integral_between(&space, &ray, hit.min(place), hit.max(place));
+                    assert!(f64::from(sigma_t) * between < 1e-5 && left < 1e-5, "{hit} {place}");
+                    met += 1;
+                }
+                None => assert!(left > -1e-5 && (f64::from(steps.0) - left).abs() < 1e-5, "{left} {}", steps.0),
+            }
+        }
+        assert!(met > 100 && met < 390, "{met}");
+    }
+
+    fn integral_between(space: &Space, ray: &Ray, from: f64, to: f64) -> f64 {
+        let mut sum = 0.0;
+        space.cells.walk(ray.origin, ray.direction, from, to, |from, to, _| {
+            sum += integral(space, ray, from, to);
+            false
+        });
+        sum
+    }
 }
