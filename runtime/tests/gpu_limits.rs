@@ -12,7 +12,7 @@ use smoke_runtime::gpu::device::ForcedLimits;
 use smoke_runtime::gpu::pass::PRELUDE;
 use smoke_runtime::gpu::renderer::{GpuRenderer, SolveOn};
 use smoke_runtime::gpu::volume::DeviceVolume;
-use smoke_runtime::gpu::{centres, decode, gmres, march, scatter, single, transfer, volume_pass};
+use smoke_runtime::gpu::{centre_solve, centres, decode, gmres, march, scatter, single, transfer, volume_pass};
 use smoke_runtime::medium::field::DensityField;
 use smoke_runtime::medium::frame::Frame;
 use smoke_runtime::renderer::{RenderSettings, Renderer, Route};
@@ -72,10 +72,13 @@ fn a_frame_above_64_mib_is_shown_in_pages_and_its_image_does_not_depend_on_them(
     told(2);
 }
 
-const SHADERS: [&str; 12] = [
+const SHADERS: [&str; 15] = [
     march::SHADER,
     volume_pass::SHADER,
     centres::SHADER,
+    centre_solve::DEPTH,
+    centre_solve::SINGLE,
+    centre_solve::PRODUCT,
     transfer::PRODUCT,
     transfer::VIEW_DIRECTIONS,
     transfer::CELLS,
