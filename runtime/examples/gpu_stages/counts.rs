@@ -52,6 +52,9 @@ const MULTIPLE_PLANES: f64 = 9.0;
 /// Ordinates of multiple scattering, and products of its iteration.
 const ORDINATES: f64 = 50.0;
 const PRODUCTS: f64 = 10.0;
+/// Directions of the quadrature at centres, and pairs of the four harmonics that the transport matrix has.
+const QUADRATURE: f64 = 98.0;
+const PAIRS: f64 = 10.0;
 /// Nodes of a brick, bytes of a node and of a float.
 const BRICK: f64 = 125.0;
 const NODE: f64 = 16.0;
@@ -119,6 +122,22 @@ pub fn stages(shape: &Shape) -> Vec<Stage> {
         ),
         stage(grid, "volume pass", When::View, volume_bytes, volume_operations, 1.0),
         march(grid),
+        stage(
+            at_centres,
+            "single scattering at centres",
+            When::Light,
+            FLOAT * QUADRATURE * gaussians * (1.0 + PLANES),
+            gaussians * PLANES * QUADRATURE * (3.0 * 15.0 + 6.0),
+            2.0,
+        ),
+        stage(
+            at_centres,
+            "product of centres",
+            When::Light,
+            PRODUCTS * PAIRS * FLOAT * gaussians * gaussians,
+            PRODUCTS * PAIRS * 4.0 * gaussians * gaussians,
+            2.0 * PRODUCTS,
+        ),
         stage(at_centres, "volume pass of centres", When::View, brick_nodes * (NODE + FLOAT), centres_operations, 1.0),
         march(at_centres),
         stage(transfer, "light of the transfer", When::Light, FLOAT * moments, 6.0 * moments, 1.0),
