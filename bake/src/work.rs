@@ -58,14 +58,22 @@ impl Work {
             }
             return Ok(Self { folder, _lock: lock });
         }
-        for entry in std::fs::read_dir(&folder).map_err(io)? {
-            let path = entry.map_err(io)?.path();
-            if path != lock_file {
+        let work = Self { folder, _lock: lock };
+        work.empty()?;
+        atomic::write_bytes(&file, fingerprint.as_bytes())?;
+        Ok(work)
+    }
+
+    /// Removes all files but the lock.
+    fn empty(&self) -> Result<()> {
+        let lock = self.folder.join(LOCK);
+        for entry in std::fs::read_dir(&self.folder).map_err(|e| smoke_formats::Error::io(&self.folder, e))? {
+            let path = entry.map_err(|e| smoke_formats::Error::io(&self.folder, e))?.path();
+            if path != lock {
                 std::fs::remove_file(&path).map_err(|e| smoke_formats::Error::io(&path, e))?;
             }
         }
-        atomic::write_bytes(&file, fingerprint.as_bytes())?;
-        Ok(Self { folder, _lock: lock })
+        Ok(())
     }
 
     /// `OUT.work`, beside the output.
@@ -154,6 +162,8 @@ impl Work {
             // Some file systems cannot sync a folder; the pack itself is safe already.
             let _ = parent.sync_all();
         }
+        // The lock last: a folder with files and without it would be taken for somebody else's.
+        self.empty()?;
         std::fs::remove_dir_all(&self.folder).map_err(|e| smoke_formats::Error::io(&self.folder, e))?;
         Ok(())
     }
@@ -180,6 +190,25 @@ mod tests {
         assert!(marker.exists(), "a refusal changes nothing");
         Work::open(&output, "two", false).unwrap();
         assert!(!marker.exists());
+    }
+
+    #[test]
+    fn a_folder_whose_bake_was_stopped_while_it_was_removed_is_resumed() {
+        let folder = tempfile::tempdir().unwrap();
+        let output = folder.path().join("a.smoke");
+        let work = Work::open(&output, "one", false).unwrap();
+        for file in ["frame.1", "frame.2", "transfer.1"] {
+            std::fs::write(Work::folder_of(&output).join(file), b"some").unwrap();
+        }
+        work.empty().unwrap();
+        let left: Vec<_> =
+            std::fs::read_dir(Work::folder_of(&output)).unwrap().map(|e| e.unwrap().file_name()).collect();
+        assert_eq!(left, [LOCK]);
+        drop(work);
+        drop(Work::open(&output, "one", true).unwrap());
+        std::fs::remove_dir_all(Work::folder_of(&output)).unwrap();
+        std::fs::create_dir(Work::folder_of(&output)).unwrap();
+        drop(Work::open(&output, "one", true).unwrap());
     }
 
     #[test]
