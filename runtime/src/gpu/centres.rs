@@ -69,7 +69,7 @@ impl CentrePass {
         Ok(Self { interpolate: Kernel::new(gpu, "volume pass of centres", source, "interpolate")? })
     }
 
-    /// Shades `volume`, which was made of `field`, for an eye in unit space; microseconds where the device can tell.
+    /// Shades `volume`, which was made of `field`, for an eye in unit space.
     /// `density` is the field's, one value a node.
     pub fn shade(
         &self,
@@ -78,7 +78,7 @@ impl CentrePass {
         (field, density): (&DensityField, &wgpu::Buffer),
         volume: &DeviceVolume,
         eye: DVec3,
-    ) -> Result<Option<f64>, GpuError> {
+    ) -> Result<(), GpuError> {
         let wide = |v: [usize; 3]| [v[0] as u32, v[1] as u32, v[2] as u32, 0];
         let pages: Vec<usize> = (0..PAGES).filter(|&page| volume.page(page).1 > 0).collect();
         let uniforms = pages.iter().map(|&page| {

@@ -196,7 +196,7 @@ impl GmresPass {
     pub fn add(&self, gpu: &Gpu, a: &Planes, own: f32, factor: f32, b: &Planes) -> Result<(), GpuError> {
         let none = || gpu.storage("sums", 0);
         let sums = Sums { blocks: none()?, sums: none()? };
-        dispatch(gpu, STAGE, &self.combine(gpu, &sums, a, own, Factor::Plain(factor), b)).map(|_| ())
+        dispatch(gpu, STAGE, &self.combine(gpu, &sums, a, own, Factor::Plain(factor), b))
     }
 }
 

@@ -76,7 +76,7 @@ impl MarchPass {
         Ok(Self { kernel: Kernel::new(gpu, "march", source, "march_pixels")? })
     }
 
-    /// Marches every pixel; and the microseconds on the device, where it can tell.
+    /// Marches every pixel.
     pub fn film(
         &self,
         gpu: &Gpu,
@@ -85,12 +85,12 @@ impl MarchPass {
         medium: &MarchMedium,
         sky: &DeviceSky,
         settings: &MarchSettings,
-    ) -> Result<(Film, Option<f64>), GpuError> {
+    ) -> Result<Film, GpuError> {
         let uniform = placed(volume, camera, [camera.width, camera.height], medium, sky, settings);
         if !settings.half_resolution {
             let mut film = Film::new(camera.width, camera.height);
-            let took = self.run(gpu, volume, sky, &uniform, None, &mut film.pixels)?;
-            return Ok((film, took));
+            self.run(gpu, volume, sky, &uniform, None, &mut film.pixels)?;
+            return Ok(film);
         }
         let size = half_resolution::coarse_size(camera);
         let mut coarse = Film::new(size[0], size[1]);
@@ -101,15 +101,13 @@ impl MarchPass {
             has_peak: 0,
             ..placed(volume, camera, size, medium, sky, settings)
         };
-        let mut microseconds = self.run(gpu, volume, sky, &alone, None, &mut coarse.pixels)?;
+        self.run(gpu, volume, sky, &alone, None, &mut coarse.pixels)?;
         let lens = Lens { camera, medium, backdrop: &*sky.sky, settings };
-        let film = half_resolution::film(&lens, &coarse, |apart| {
+        half_resolution::film(&lens, &coarse, |apart| {
             let mut pixels = vec![Pixel::EMPTY; apart.len()];
-            let took = self.run(gpu, volume, sky, &uniform, Some(apart), &mut pixels)?;
-            microseconds = microseconds.zip(took).map(|(sum, took)| sum + took);
+            self.run(gpu, volume, sky, &uniform, Some(apart), &mut pixels)?;
             Ok(pixels)
-        })?;
-        Ok((film, microseconds))
+        })
     }
 
     /// Marches the pixels of the film that `all` describes, or those `listed` by column and row.
@@ -121,11 +119,10 @@ impl MarchPass {
         all: &March,
         listed: Option<&[[usize; 2]]>,
         pixels: &mut [Pixel],
-    ) -> Result<Option<f64>, GpuError> {
+    ) -> Result<(), GpuError> {
         let most = (gpu.summary().storage_binding.min(gpu.summary().buffer) as usize / size_of::<DevicePixel>()).max(1);
         let run = (RAYS / (all.samples * all.samples) as usize).clamp(1, most).min(pixels.len().max(1));
         let out = gpu.storage("pixels of the image", (run * size_of::<DevicePixel>()) as u64)?;
-        let mut microseconds = Some(0.0);
         for (number, pixels) in pixels.chunks_mut(run).enumerate() {
             if let Some(listed) = listed {
                 let place = |&[x, y]: &[usize; 2]| DevicePixel {
@@ -146,8 +143,7 @@ impl MarchPass {
             let inputs = [&uniform, &volume.places, a, b, c, d, &sky.environments, &sky.texels, &out];
             let buffers: Vec<(u32, &wgpu::Buffer)> = (0..).zip(inputs).collect();
             let step = Step { kernel: &self.kernel, buffers: &buffers, threads: pixels.len() as u32 };
-            let took = gpu.dispatch("view pass", &[step])?;
-            microseconds = microseconds.zip(took).map(|(sum, took)| sum + took);
+            gpu.dispatch("view pass", &[step])?;
             let marched: Vec<DevicePixel> = gpu.read("view pass", &out, pixels.len())?;
             for (pixel, DevicePixel { radiance: [r, g, b, depth], transmittance: [x, y, z, _] }) in
                 pixels.iter_mut().zip(marched)
@@ -156,7 +152,7 @@ impl MarchPass {
                 *pixel = Pixel { radiance: [r, g, b], transmittance: [x, y, z], depth };
             }
         }
-        Ok(microseconds)
+        Ok(())
     }
 }
 

@@ -100,8 +100,9 @@ impl Gpu {
         })
     }
 
-    /// Does the steps in order, as one submission, and waits. Microseconds on the device, where it can tell.
-    pub fn dispatch(&self, stage: &'static str, steps: &[Step]) -> Result<Option<f64>, GpuError> {
+    /// Does the steps in order, as one submission, and waits. What they took goes to [`Self::take_times`], where the
+    /// device can tell.
+    pub fn dispatch(&self, stage: &'static str, steps: &[Step]) -> Result<(), GpuError> {
         self.checked(stage, || {
             let clock = self.summary().timestamps.then(|| {
                 let descriptor =
@@ -147,18 +148,18 @@ impl Gpu {
             });
             self.queue.submit([encoder.finish()]);
             self.wait(stage)?;
-            let Some(times) = times else { return Ok(None) };
+            let Some(times) = times else { return Ok(()) };
             let ticks: Vec<u64> = self.copy_back(stage, &times, 16)?;
             let period = f64::from(self.queue.get_timestamp_period());
-            let took = ticks[1].checked_sub(ticks[0]).map(|ticks| ticks as f64 * period * 1e-3);
-            if let Some(took) = took {
+            if let Some(ticks) = ticks[1].checked_sub(ticks[0]) {
+                let took = ticks as f64 * period * 1e-3;
                 let mut times = self.times.lock().unwrap_or_else(PoisonError::into_inner);
                 match times.iter_mut().find(|(name, _)| *name == stage) {
                     Some((_, sum)) => *sum += took,
                     None => times.push((stage, took)),
                 }
             }
-            Ok(took)
+            Ok(())
         })
     }
 

@@ -172,7 +172,7 @@ impl GpuRenderer {
         let start = Instant::now();
         let film = match (medium, &self.loaded, &self.sky) {
             (Some(medium), Some(loaded), Some(sky)) => {
-                self.march.film(&self.gpu, &loaded.volume, camera, &medium, sky, &self.march_settings)?.0
+                self.march.film(&self.gpu, &loaded.volume, camera, &medium, sky, &self.march_settings)?
             }
             _ => Film::new(camera.width, camera.height),
         };

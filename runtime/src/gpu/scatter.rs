@@ -146,7 +146,7 @@ impl Gather<'_> {
 
     /// [`Self::add`] at once.
     pub fn add_now(&self, gpu: &Gpu, source: &Planes, out: &Planes) -> Result<(), GpuError> {
-        dispatch(gpu, "multiple scattering", &self.add(gpu, source, out)).map(|_| ())
+        dispatch(gpu, "multiple scattering", &self.add(gpu, source, out))
     }
 
     fn add_batch<'b>(

@@ -30,7 +30,7 @@ pub fn check(gpu: &Gpu, pass: &MarchPass) -> Result<(), GpuError> {
     let sky = Arc::new(Sky::new(&[], None));
     let expected = march(&volume, &camera, &medium, &*sky, &settings);
     let on_device = DeviceVolume::of_shaded(gpu, &volume)?;
-    let (found, _) = pass.film(gpu, &on_device, &camera, &medium, &DeviceSky::new(gpu, &sky)?, &settings)?;
+    let found = pass.film(gpu, &on_device, &camera, &medium, &DeviceSky::new(gpu, &sky)?, &settings)?;
     let mut worst = 0.0f32;
     for (a, b) in expected.pixels.iter().zip(&found.pixels) {
         for c in 0..3 {

@@ -108,7 +108,7 @@ impl Work<'_> {
 }
 
 /// Does `work` in order, as one submission.
-pub(super) fn dispatch(gpu: &Gpu, stage: &'static str, work: &[Work]) -> Result<Option<f64>, GpuError> {
+pub(super) fn dispatch(gpu: &Gpu, stage: &'static str, work: &[Work]) -> Result<(), GpuError> {
     let buffers: Vec<Vec<(u32, &wgpu::Buffer)>> = work.iter().map(Work::all_buffers).collect();
     let steps = work.iter().zip(&buffers);
     let steps: Vec<Step> =

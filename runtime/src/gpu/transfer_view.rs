@@ -15,7 +15,7 @@ use crate::transport::transfer::view_directions::{ViewDirections, squares};
 use glam::DVec3;
 
 impl TransferPass {
-    /// Shades `volume`, which was made of `field`, for an eye in world space; microseconds where the device can tell.
+    /// Shades `volume`, which was made of `field`, for an eye in world space.
     /// `density` is the field's, one value a node.
     pub fn shade(
         &self,
@@ -25,7 +25,7 @@ impl TransferPass {
         (field, density): (&DensityField, &wgpu::Buffer),
         volume: &DeviceVolume,
         eye: DVec3,
-    ) -> Result<Option<f64>, GpuError> {
+    ) -> Result<(), GpuError> {
         let linear = field.world_from_node.matrix3;
         let node_eye = field.world_from_node.inverse().transform_point3(eye);
         let largest = linear.to_cols_array().into_iter().fold(0.0f64, |m, v| m.max(v.abs()));

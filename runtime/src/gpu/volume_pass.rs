@@ -87,7 +87,7 @@ impl VolumePass {
         Ok(Self { add, finish: Kernel::new(gpu, "volume pass", source, "finish")? })
     }
 
-    /// Shades `volume`, which was made of `field`, for an eye in world space; microseconds where the device can tell.
+    /// Shades `volume`, which was made of `field`, for an eye in world space.
     /// `density` is the field's, one value a node.
     pub fn shade(
         &self,
@@ -96,7 +96,7 @@ impl VolumePass {
         (field, density): (&DensityField, &wgpu::Buffer),
         volume: &DeviceVolume,
         eye: DVec3,
-    ) -> Result<Option<f64>, GpuError> {
+    ) -> Result<(), GpuError> {
         let linear = field.world_from_node.matrix3;
         let largest = linear.to_cols_array().into_iter().fold(0.0f64, |m, v| m.max(v.abs()));
         let four = |v: DVec3| v.as_vec3().extend(0.0).to_array();
