@@ -8,18 +8,24 @@ use glam::{DAffine3, DVec3};
 use gpu_common::{cameras, device, difference, radiance, sky, told};
 use naga::TypeInner;
 use smoke_formats::gaussian::UnitSpace;
+use smoke_runtime::backdrop::Sky;
+use smoke_runtime::camera::Camera;
 use smoke_runtime::gpu::device::ForcedLimits;
+use smoke_runtime::gpu::march::{self as gpu_march, DeviceSky, MarchPass};
 use smoke_runtime::gpu::pass::PRELUDE;
 use smoke_runtime::gpu::renderer::{GpuRenderer, SolveOn};
 use smoke_runtime::gpu::volume::DeviceVolume;
-use smoke_runtime::gpu::{centre_solve, centres, decode, gmres, march, scatter, single, transfer, volume_pass};
+use smoke_runtime::gpu::{centre_solve, centres, decode, gmres, scatter, single, transfer, volume_pass};
+use smoke_runtime::march::{self, MarchMedium, MarchSettings};
 use smoke_runtime::medium::field::DensityField;
 use smoke_runtime::medium::frame::Frame;
 use smoke_runtime::renderer::{RenderSettings, Renderer, Route};
+use smoke_runtime::shaded_volume::ShadedVolume;
 use smoke_runtime::transport::ScatteringOrder;
 use smoke_runtime::transport::compensated::grid::route::GridSettings;
 use smoke_runtime::transport::medium::MediumParameters;
 use std::path::Path;
+use std::sync::Arc;
 
 /// Relative RMSE of images: what the device is promised to keep.
 const IMAGE: f64 = 2e-3;
@@ -72,8 +78,47 @@ fn a_frame_above_64_mib_is_shown_in_pages_and_its_image_does_not_depend_on_them(
     told(2);
 }
 
+#[test]
+fn pages_that_are_taken_for_each_other_are_found() {
+    // 8^3 bricks of 2,000 bytes: four pages of 131 bricks at most.
+    let Some(gpu) = device(ForcedLimits { storage_binding: Some(256 << 10) }) else { return };
+    let node = |v: usize| {
+        let at = [v % 33, v / 33 % 33, v / 1089].map(|c| c as f32 / 32.0);
+        [at[0], at[1], at[2], 0.5 + 0.4 * (9.0 * at[2]).sin()]
+    };
+    let nodes: Vec<[f32; 4]> = (0..33 * 33 * 33).map(node).collect();
+    let shaded = ShadedVolume::of_nodes([33; 3], &nodes, DAffine3::from_scale(DVec3::splat(1.0 / 32.0)));
+    let volume = DeviceVolume::of_shaded(&gpu, &shaded).unwrap();
+    assert!((0..4).all(|page| volume.page(page).1 > 0));
+    let camera = Camera::look_at(DVec3::new(2.0, -1.5, 1.2), DVec3::splat(0.5), DVec3::Z, 50.0, 48, 36);
+    let (medium, settings) = (MarchMedium::plain([3.0; 3]), MarchSettings::default());
+    let sky = Arc::new(Sky::new(&[], None));
+    let expected = radiance(&march::march(&shaded, &camera, &medium, &*sky, &settings));
+    let off = |source: &str| {
+        let pass = MarchPass::from_source(&gpu, source).unwrap();
+        let on_device = DeviceSky::new(&gpu, &sky).unwrap();
+        difference(&expected, &radiance(&pass.film(&gpu, &volume, &camera, &medium, &on_device, &settings).unwrap()))
+    };
+    assert!(off(gpu_march::SHADER) <= 1e-5);
+    let mut cases = 1;
+    for (page, other) in
+        [("nodes_0", "nodes_1"), ("nodes_1", "nodes_2"), ("nodes_2", "nodes_3"), ("nodes_3", "nodes_0")]
+    {
+        let (from, to) = (format!("return {page}[at]"), format!("return {other}[at]"));
+        assert!(gpu_march::SHADER.contains(&from) && gpu_march::SHADER.contains(&to));
+        // One for the other and back: a buffer that is not read has no binding.
+        let mixed =
+            gpu_march::SHADER.replace(&from, "return both[at]").replace(&to, &from).replace("return both[at]", &to);
+        let worst = off(&mixed);
+        eprintln!("{from} -> {to}: {worst:.1e}");
+        assert!(worst > 1e-3, "{from}: {worst}");
+        cases += 1;
+    }
+    told(cases);
+}
+
 const SHADERS: [&str; 15] = [
-    march::SHADER,
+    gpu_march::SHADER,
     volume_pass::SHADER,
     centres::SHADER,
     centre_solve::DEPTH,
@@ -124,5 +169,5 @@ fn no_shader_declares_a_texture_so_that_no_limit_on_their_sides_matters() {
     }
     // One that does is found.
     let planted = "@group(0) @binding(9) var volume: texture_3d<f32>;\n@group(0) @binding(10) var s: sampler;\n";
-    assert_eq!(textures(&format!("{planted}{}", march::SHADER)), 2);
+    assert_eq!(textures(&format!("{planted}{}", gpu_march::SHADER)), 2);
 }
