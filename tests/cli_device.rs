@@ -17,11 +17,7 @@ const FRAMES: std::ops::RangeInclusive<i32> = 1..=8;
 
 /// The name of the device, or none where tests are told to do without or there is none; says which.
 fn device(folder: &Path) -> Option<String> {
-    let mode = std::env::var("SMOKE_GPU").unwrap_or_else(|_| "auto".into());
-    assert!(
-        ["off", "auto", "require"].contains(&mode.as_str()),
-        "SMOKE_GPU: found {mode}, expected off, auto, require"
-    );
+    let mode = common::gpu_mode();
     let list: Value = serde_json::from_str(&answer(folder, &["devices", "--json"])).unwrap();
     let name = list[0]["name"].as_str().filter(|_| mode != "off").map(str::to_owned);
     assert!(name.is_some() || mode != "require", "SMOKE_GPU=require: no graphics device");

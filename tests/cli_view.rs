@@ -36,11 +36,9 @@ mod window {
 
     /// Whether the test of the window is to run, and whether it must.
     fn wanted() -> Option<bool> {
-        match std::env::var("SMOKE_GPU").as_deref() {
-            Ok("off") => None,
-            Ok("require") => Some(true),
-            Ok("auto") | Err(_) => Some(false),
-            Ok(other) => panic!("SMOKE_GPU: found {other}, expected off, auto or require"),
+        match common::gpu_mode().as_str() {
+            "off" => None,
+            mode => Some(mode == "require"),
         }
     }
 

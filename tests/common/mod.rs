@@ -52,6 +52,16 @@ pub fn refusal(folder: &Path, line: &[&str]) -> String {
     message.to_owned()
 }
 
+/// What `SMOKE_GPU` says of graphics devices: off, require, or auto, the default.
+pub fn gpu_mode() -> String {
+    let mode = std::env::var("SMOKE_GPU").unwrap_or_else(|_| "auto".into());
+    assert!(
+        ["off", "auto", "require"].contains(&mode.as_str()),
+        "SMOKE_GPU: found {mode}, expected off, auto, require"
+    );
+    mode
+}
+
 /// Bytes as text.
 pub fn text(bytes: &[u8]) -> &str {
     std::str::from_utf8(bytes).unwrap()

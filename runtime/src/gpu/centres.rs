@@ -5,7 +5,7 @@
 use super::device::{Gpu, GpuError};
 use super::layouts::CentreVolume as Uniform;
 use super::pass::{GROUP, Kernel, Step};
-use super::volume::{DeviceVolume, PAGES};
+use super::volume::{DeviceVolume, PAGES, wide};
 use crate::medium::field::DensityField;
 use crate::transport::compensated::centres::source::CentreSource;
 use glam::DVec3;
@@ -41,10 +41,10 @@ impl DeviceCentres {
         };
         let gaussians: Vec<[f32; 4]> = (0..points.len()).map(gaussian).collect();
         // Where light is the same from everywhere, its mean is all there is.
-        let (all, bands) = (source.radiance.order, if source.is_even() { 1 } else { source.radiance.order });
+        let (all, bands) = (source.radiance.order, if source.radiance.is_even() { 1 } else { source.radiance.order });
         let each = source.radiance.coefficients.chunks_exact(all * all).flat_map(|j| &j[..bands * bands]);
         let radiance: Vec<[f32; 4]> = each.map(|&[r, g, b]| [r, g, b, 0.0]).collect();
-        let axes: Vec<f32> = (0..3).flat_map(|a| source.axis(a, field.dims[a])).collect();
+        let axes = source.axes(field.dims).concat();
         gpu.checked("Gaussians", || {
             Ok(Self {
                 count: points.len(),
@@ -79,7 +79,6 @@ impl CentrePass {
         volume: &DeviceVolume,
         eye: DVec3,
     ) -> Result<(), GpuError> {
-        let wide = |v: [usize; 3]| [v[0] as u32, v[1] as u32, v[2] as u32, 0];
         let pages: Vec<usize> = (0..PAGES).filter(|&page| volume.page(page).1 > 0).collect();
         let uniforms = pages.iter().map(|&page| {
             let (first_brick, bricks) = volume.page(page);

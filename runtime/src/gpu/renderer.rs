@@ -13,6 +13,7 @@ use super::self_test;
 use super::transfer::{DeviceLight, DeviceTransfer, TransferPass};
 use super::volume::DeviceVolume;
 use super::volume_pass::{DeviceSource, VolumePass};
+use crate::backdrop::Sky;
 use crate::camera::Camera;
 use crate::film::Film;
 use crate::light::Light;
@@ -60,12 +61,22 @@ struct Loaded {
 }
 
 impl Loaded {
-    /// Its bricks, not yet shaded, and its density.
-    fn of_field(gpu: &Gpu, field: &DensityField) -> Result<Self, GpuError> {
-        let density = gpu.upload("density of the frame", &field.values)?;
-        Ok(Self { volume: DeviceVolume::of_field(gpu, field)?, density })
+    /// What `slot` holds of the frame, made now if it is empty: bricks, not yet shaded, and density are the same under any
+    /// light.
+    fn of<'a>(slot: &'a mut Option<Self>, gpu: &Gpu, field: &DensityField) -> Result<&'a Self, GpuError> {
+        let loaded = match slot.take() {
+            Some(loaded) => loaded,
+            None => {
+                let density = gpu.upload("density of the frame", &field.values)?;
+                Self { volume: DeviceVolume::of_field(gpu, field)?, density }
+            }
+        };
+        Ok(slot.insert(loaded))
     }
 }
+
+/// What a shaded volume is marched with, and what is behind it.
+type Shaded = (MarchMedium, Arc<Sky>);
 
 /// See the module's head.
 pub struct GpuRenderer {
@@ -165,13 +176,18 @@ impl GpuRenderer {
     /// The image from `camera`, and the seconds it took, copies included; empty pixels before any frame.
     pub fn render(&mut self, camera: &Camera) -> Result<(Film, Seconds), GpuRenderError> {
         let mut seconds = Seconds::default();
-        let medium = match self.shade_grid(camera, &mut seconds)? {
-            Some(medium) => Some(medium),
+        let shaded = match self.shade_grid(camera, &mut seconds)? {
+            Some(shaded) => Some(shaded),
             None => self.shade(camera, &mut seconds)?,
         };
         let start = Instant::now();
-        let film = match (medium, &self.loaded, &self.sky) {
-            (Some(medium), Some(loaded), Some(sky)) => {
+        let film = match (shaded, &self.loaded) {
+            (Some((medium, sky)), Some(loaded)) => {
+                let sky = match self.sky.take() {
+                    Some(sky) => sky,
+                    None => DeviceSky::new(&self.gpu, &sky)?,
+                };
+                let sky = self.sky.insert(sky);
                 self.march.film(&self.gpu, &loaded.volume, camera, &medium, sky, &self.march_settings)?
             }
             _ => Film::new(camera.width, camera.height),
@@ -180,8 +196,9 @@ impl GpuRenderer {
         Ok((film, seconds))
     }
 
-    /// The grid route up to its shaded volume, and the medium to march; none for other routes and before any frame.
-    fn shade_grid(&mut self, camera: &Camera, seconds: &mut Seconds) -> Result<Option<MarchMedium>, GpuRenderError> {
+    /// The grid route up to its shaded volume; gives what is marched and what is behind it, none for other routes and before
+    /// any frame.
+    fn shade_grid(&mut self, camera: &Camera, seconds: &mut Seconds) -> Result<Option<Shaded>, GpuRenderError> {
         let start = Instant::now();
         let Some(Unlit { problem, medium, sky }) = self.solver.unlit() else { return Ok(None) };
         let gpu = &*self.gpu;
@@ -198,25 +215,18 @@ impl GpuRenderer {
         seconds.source_radiance = start.elapsed().as_secs_f64();
         let start = Instant::now();
         let eye = self.eye.take().filter(|&eye| eye == camera.position || !source.depends_on_view());
-        let loaded = match self.loaded.take() {
-            Some(loaded) => loaded,
-            None => Loaded::of_field(gpu, problem.field)?,
-        };
-        let loaded = self.loaded.insert(loaded);
+        let loaded = Loaded::of(&mut self.loaded, gpu, problem.field)?;
         if eye.is_none() {
             let density = (problem.field, &loaded.density);
             self.volume_pass.shade(gpu, source, density, &loaded.volume, camera.position)?;
         }
         self.eye = Some(eye.unwrap_or(camera.position));
-        if self.sky.is_none() {
-            self.sky = Some(DeviceSky::new(gpu, sky)?);
-        }
         seconds.volume_pass = start.elapsed().as_secs_f64();
-        Ok(Some(medium))
+        Ok(Some((medium, sky.clone())))
     }
 
     /// The same for the other routes; none before any frame.
-    fn shade(&mut self, camera: &Camera, seconds: &mut Seconds) -> Result<Option<MarchMedium>, GpuRenderError> {
+    fn shade(&mut self, camera: &Camera, seconds: &mut Seconds) -> Result<Option<Shaded>, GpuRenderError> {
         let start = Instant::now();
         let Some(Lit { field, source, medium, sky, .. }) = self.solver.lit()? else {
             return Ok(None);
@@ -235,12 +245,7 @@ impl GpuRenderer {
         seconds.source_radiance = start.elapsed().as_secs_f64();
         let start = Instant::now();
         let eye = self.eye.take().filter(|&eye| eye == camera.position || !source.depends_on_view());
-        // A frame's bricks are the same under any light.
-        let loaded = match self.loaded.take() {
-            Some(loaded) => loaded,
-            None => Loaded::of_field(gpu, field)?,
-        };
-        let loaded = self.loaded.insert(loaded);
+        let loaded = Loaded::of(&mut self.loaded, gpu, field)?;
         if let (None, Some(device), Some(centres)) = (eye, &self.centres, source.as_centres()) {
             let eye = centres.unit_from_world(camera.position);
             self.centre_pass.shade(gpu, device, (field, &loaded.density), &loaded.volume, eye)?;
@@ -250,10 +255,7 @@ impl GpuRenderer {
             self.transfer_pass.shade(gpu, frame, light, density, &loaded.volume, camera.position)?;
         }
         self.eye = Some(eye.unwrap_or(camera.position));
-        if self.sky.is_none() {
-            self.sky = Some(DeviceSky::new(gpu, sky)?);
-        }
         seconds.volume_pass = start.elapsed().as_secs_f64();
-        Ok(Some(*medium))
+        Ok(Some((*medium, sky.clone())))
     }
 }

@@ -8,7 +8,7 @@ use super::device::{Gpu, GpuError};
 use super::layouts::{Cells as CellsUniform, Transfer as TransferUniform};
 use super::pass::Kernel;
 use super::transfer::{DeviceLight, DeviceTransfer, TransferPass, Work, dispatch};
-use super::volume::{DeviceVolume, PAGES};
+use super::volume::{DeviceVolume, PAGES, seen_from, wide};
 use crate::medium::field::DensityField;
 use crate::shaded_volume::BRICK_NODES;
 use crate::transport::transfer::view_directions::{ViewDirections, squares};
@@ -28,11 +28,9 @@ impl TransferPass {
     ) -> Result<(), GpuError> {
         let linear = field.world_from_node.matrix3;
         let node_eye = field.world_from_node.inverse().transform_point3(eye);
-        let largest = linear.to_cols_array().into_iter().fold(0.0f64, |m, v| m.max(v.abs()));
         let four = |v: DVec3| v.as_vec3().extend(0.0).to_array();
-        let [column_x, column_y, column_z] = [linear.x_axis, linear.y_axis, linear.z_axis].map(|c| four(c / largest));
-        let wide = |v: [usize; 3]| [v[0] as u32, v[1] as u32, v[2] as u32, 0];
-        let (eye, dims, bricks) = (four(node_eye), wide(field.dims), wide(volume.bricks));
+        let [eye, column_x, column_y, column_z] = seen_from(eye, field);
+        let (dims, bricks) = (wide(field.dims), wide(volume.bricks));
         let cells = CellsUniform {
             eye,
             column_x,

@@ -6,7 +6,7 @@
 use super::device::{Gpu, GpuError};
 use crate::medium::field::DensityField;
 use crate::shaded_volume::{BRICK_NODES, BrickTable, ShadedVolume};
-use glam::DAffine3;
+use glam::{DAffine3, DVec3};
 
 /// Buffers that the nodes are spread over.
 pub const PAGES: usize = 4;
@@ -35,6 +35,21 @@ pub struct DeviceVolume {
     pub dense_bricks: wgpu::Buffer,
     /// [`PAGES`] buffers `array<vec4<f32>>`, 125 nodes a brick, x fastest: `[J red, J green, J blue, D]`.
     pub pages: Vec<wgpu::Buffer>,
+}
+
+/// Three counts as a uniform has them.
+pub(super) fn wide(v: [usize; 3]) -> [u32; 4] {
+    [v[0] as u32, v[1] as u32, v[2] as u32, 0]
+}
+
+/// An eye of the world in node space, and the columns of the map to the world scaled to at most 1, which give directions
+/// alone, as uniforms have them.
+pub(super) fn seen_from(eye: DVec3, field: &DensityField) -> [[f32; 4]; 4] {
+    let linear = field.world_from_node.matrix3;
+    let largest = linear.to_cols_array().into_iter().fold(0.0f64, |m, v| m.max(v.abs()));
+    let node_eye = field.world_from_node.inverse().transform_point3(eye);
+    [node_eye, linear.x_axis / largest, linear.y_axis / largest, linear.z_axis / largest]
+        .map(|v| v.as_vec3().extend(0.0).to_array())
 }
 
 impl DeviceVolume {

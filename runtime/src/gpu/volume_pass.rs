@@ -6,7 +6,7 @@ use super::device::{Gpu, GpuError};
 use super::layouts::VolumePass as Uniform;
 use super::pass::{Kernel, Step};
 use super::planes::{Part, Planes};
-use super::volume::{DeviceVolume, PAGES};
+use super::volume::{DeviceVolume, PAGES, seen_from, wide};
 use crate::medium::field::DensityField;
 use crate::shaded_volume::BRICK_NODES;
 use crate::transport::compensated::grid::route::GridSource;
@@ -97,15 +97,12 @@ impl VolumePass {
         volume: &DeviceVolume,
         eye: DVec3,
     ) -> Result<(), GpuError> {
-        let linear = field.world_from_node.matrix3;
-        let largest = linear.to_cols_array().into_iter().fold(0.0f64, |m, v| m.max(v.abs()));
-        let four = |v: DVec3| v.as_vec3().extend(0.0).to_array();
-        let wide = |v: [usize; 3]| [v[0] as u32, v[1] as u32, v[2] as u32, 0];
+        let [eye, column_x, column_y, column_z] = seen_from(eye, field);
         let base = Uniform {
-            eye: four(field.world_from_node.inverse().transform_point3(eye)),
-            column_x: four(linear.x_axis / largest),
-            column_y: four(linear.y_axis / largest),
-            column_z: four(linear.z_axis / largest),
+            eye,
+            column_x,
+            column_y,
+            column_z,
             dims: wide(field.dims),
             bricks: wide(volume.bricks),
             channels: source.channels as u32,

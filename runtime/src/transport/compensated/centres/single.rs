@@ -46,6 +46,14 @@ pub enum IncidentRadiance {
     Sampled(Vec<[f32; 3]>),
 }
 
+impl CentreRadiance {
+    /// True if light goes out alike in all directions.
+    pub fn is_even(&self) -> bool {
+        let mut each = self.coefficients.chunks_exact(self.order * self.order);
+        each.all(|j| j[1..].iter().all(|v| *v == [0.0; 3]))
+    }
+}
+
 impl IncidentRadiance {
     /// Radiance along `directions`, channel by channel, padded like them. Harmonics are clamped to >= 0.
     pub fn sampled(&self, directions: &Directions) -> [Vec<f32>; 3] {

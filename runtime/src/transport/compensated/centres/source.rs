@@ -4,7 +4,7 @@
 //! must be a uniform scale with a rotation or reflection.
 
 use super::single::CentreRadiance;
-use super::volume_pass::{ViewDirections, volume_pass};
+use super::volume_pass::{ViewDirections, axes, volume_pass};
 use crate::medium::field::DensityField;
 use crate::medium::frame::Frame;
 use crate::medium::gaussian_points::GaussianPoints;
@@ -51,15 +51,9 @@ impl CentreSource {
         Self { points, radiance, unit: frame.unit, placement, first_node: frame.first_node }
     }
 
-    /// True if light goes out alike in all directions.
-    pub(crate) fn is_even(&self) -> bool {
-        let bands = self.radiance.order * self.radiance.order;
-        self.radiance.coefficients.chunks_exact(bands).all(|j| j[1..].iter().all(|v| *v == [0.0; 3]))
-    }
-
-    /// Unit coordinates of the first `count` nodes along `axis`.
-    pub fn axis(&self, axis: usize, count: usize) -> impl Iterator<Item = f32> {
-        (0..count).map(move |i| self.unit.coordinate(axis, self.first_node[axis].saturating_add(i as i32)))
+    /// Unit coordinates of the nodes of a field of `dims`, axis by axis.
+    pub fn axes(&self, dims: [usize; 3]) -> [Vec<f32>; 3] {
+        axes(&self.unit, self.first_node, dims)
     }
 
     /// A point of the world in unit space.
@@ -70,7 +64,7 @@ impl CentreSource {
 
 impl SourceRadiance for CentreSource {
     fn depends_on_view(&self) -> bool {
-        !self.is_even()
+        !self.radiance.is_even()
     }
 
     fn as_centres(&self) -> Option<&CentreSource> {

@@ -51,19 +51,16 @@ pub fn volume_pass(
     if points.is_empty() || out.is_empty() {
         return out;
     }
-    let isotropic = radiance.coefficients.chunks_exact(bands).all(|j| j[1..].iter().all(|v| *v == [0.0; 3]));
     // What is interpolated, per Gaussian: harmonics for an eye, else radiance along the one direction.
     let (stride, sources): (usize, Vec<[f32; 3]>) = match view {
-        ViewDirections::Eye(_) if !isotropic => (bands, radiance.coefficients.clone()),
+        ViewDirections::Eye(_) if !radiance.is_even() => (bands, radiance.coefficients.clone()),
         _ => {
             let direction = if let ViewDirections::Parallel(d) = view { d } else { [0.0, 0.0, 1.0] };
             let y = evaluate(radiance.order, direction.into());
             (1, radiance.coefficients.chunks_exact(bands).map(|j| along(j, &y)).collect())
         }
     };
-    let axes: [Vec<f32>; 3] = std::array::from_fn(|a| {
-        (0..dims[a]).map(|i| space.coordinate(a, origin[a].saturating_add(i as i32))).collect()
-    });
+    let axes = axes(space, origin, dims);
     out.par_chunks_mut(dims[0] * dims[1]).enumerate().for_each(|(k, out)| {
         let (density, planes) = interpolate(points, &sources, stride, &axes, k);
         let mut nearest = vec![usize::MAX; dims[0].div_ceil(BRICK) * dims[1].div_ceil(BRICK)];
@@ -94,6 +91,11 @@ pub fn volume_pass(
         }
     });
     out
+}
+
+/// Unit coordinates of the voxels `origin .. origin + dims` of `space`, axis by axis.
+pub fn axes(space: &UnitSpace, origin: [i32; 3], dims: [usize; 3]) -> [Vec<f32>; 3] {
+    std::array::from_fn(|a| (0..dims[a]).map(|i| space.coordinate(a, origin[a].saturating_add(i as i32))).collect())
 }
 
 fn along(coefficients: &[[f32; 3]], y: &[f32; MAX_COEFFICIENTS]) -> [f32; 3] {
