@@ -33,7 +33,7 @@ const SUN_A_NODE: f64 = 2.7e-9;
 const SHADE: f64 = 1.2e-3;
 const SHADE_A_VOXEL: f64 = 1.25e-8;
 const DIRECTED: f64 = 6e-3;
-/// Measured bakes of frame 6 of the shipped plume (`docs/decisions/050-transfer.md`): optical depth (95th percentile), and
+/// Measured bakes of frame 6 of the shipped plume (`docs/decisions/033-plan.md`): optical depth (95th percentile), and
 /// seconds a million voxels on two threads at g = 0 and g = 0.5.
 const BAKED: [(f64, [f64; 2]); 3] = [(1.51, [200.0, 270.0]), (9.08, [260.0, 340.0]), (60.5, [330.0, 430.0])];
 /// g at which the second of [`BAKED`] was measured.
