@@ -1,4 +1,4 @@
-//! `smoke-bake devices`, and the device that `--device` means.
+//! `smoke-bake devices`, the device that `--device` means, and frames on it.
 
 #[cfg(feature = "gpu")]
 use crate::answer;
@@ -7,6 +7,8 @@ use crate::failure::Failure;
 #[cfg(feature = "gpu")]
 use smoke_runtime::gpu::device::{Choice, ForcedLimits, Gpu, adapters};
 #[cfg(feature = "gpu")]
+use smoke_runtime::gpu::upload::UploadedFrame;
+use smoke_runtime::medium::frame::Frame;
 use std::sync::Arc;
 
 /// What marches.
@@ -17,6 +19,37 @@ pub enum Device {
     /// An open graphics device.
     #[cfg(feature = "gpu")]
     Gpu(Arc<Gpu>),
+}
+
+/// A frame where its device draws it from.
+#[derive(Clone)]
+pub enum DeviceFrame {
+    /// In memory, for the processor.
+    Cpu(Arc<Frame>),
+    /// On a graphics device, and in memory.
+    #[cfg(feature = "gpu")]
+    Gpu(Arc<UploadedFrame>),
+}
+
+impl DeviceFrame {
+    /// The frame in memory.
+    pub fn frame(&self) -> &Arc<Frame> {
+        match self {
+            Self::Cpu(frame) => frame,
+            #[cfg(feature = "gpu")]
+            Self::Gpu(uploaded) => &uploaded.frame,
+        }
+    }
+
+    /// Bytes on a graphics device.
+    #[cfg_attr(not(feature = "view"), expect(dead_code, reason = "only the window keeps frames"))]
+    pub fn device_bytes(&self) -> u64 {
+        match self {
+            Self::Cpu(_) => 0,
+            #[cfg(feature = "gpu")]
+            Self::Gpu(uploaded) => uploaded.bytes(),
+        }
+    }
 }
 
 #[cfg(not(feature = "gpu"))]
@@ -42,6 +75,23 @@ impl Device {
     #[cfg(not(feature = "gpu"))]
     fn open_graphics(_: &str) -> Result<Self, Failure> {
         Err(Failure::work(WITHOUT))
+    }
+
+    /// True for one with memory of its own.
+    pub fn is_graphics(&self) -> bool {
+        !matches!(self, Self::Cpu)
+    }
+
+    /// Takes a frame to where it is drawn from: a graphics device gets a copy, on any thread. The error is a line of text.
+    pub fn take(&self, frame: Arc<Frame>) -> Result<DeviceFrame, String> {
+        match self {
+            Self::Cpu => Ok(DeviceFrame::Cpu(frame)),
+            #[cfg(feature = "gpu")]
+            Self::Gpu(gpu) => {
+                let uploaded = UploadedFrame::new(gpu, frame).map_err(|e| e.to_string())?;
+                Ok(DeviceFrame::Gpu(Arc::new(uploaded)))
+            }
+        }
     }
 
     /// As an image's metadata has it: `cpu`, or the adapter's name.

@@ -13,6 +13,7 @@ mod inspect;
 mod layers;
 mod marcher;
 mod method;
+mod pipeline;
 mod plan;
 mod progress;
 mod reference;

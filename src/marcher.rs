@@ -1,21 +1,20 @@
 //! What marches a frame: the processor's renderer or a graphics device's, behind the same calls.
 
-use crate::devices::Device;
+use crate::devices::{Device, DeviceFrame};
 use crate::staging::Stage;
 use smoke_runtime::camera::Camera;
 use smoke_runtime::film::Film;
 #[cfg(feature = "gpu")]
 use smoke_runtime::gpu::renderer::{GpuRenderer, SolveOn};
 use smoke_runtime::light::Light;
-use smoke_runtime::medium::frame::Frame;
 use smoke_runtime::renderer::{RenderSettings, Renderer, Seconds};
 use smoke_runtime::transport::medium::MediumParameters;
 
 /// Frame, lights, medium and camera in, image and seconds out; errors as a line of text. What an edit does not touch is
 /// kept, see [`Renderer`].
 pub trait Marcher: Send {
-    /// Another frame.
-    fn set_frame(&mut self, frame: Frame) -> Result<(), String>;
+    /// Another frame, which the same device has taken.
+    fn set_frame(&mut self, frame: DeviceFrame) -> Result<(), String>;
     /// Other lights.
     #[cfg_attr(not(feature = "view"), expect(dead_code, reason = "only the window edits"))]
     fn set_lights(&mut self, lights: Vec<Light>) -> Result<(), String>;
@@ -30,10 +29,14 @@ pub trait Marcher: Send {
 
 /// The same calls of either renderer.
 macro_rules! marches {
-    ($renderer:ty, $times:expr) => {
+    ($renderer:ty, $of:ident, $times:expr) => {
         impl Marcher for $renderer {
-            fn set_frame(&mut self, frame: Frame) -> Result<(), String> {
-                Self::set_frame(self, frame).map_err(|e| e.to_string())
+            fn set_frame(&mut self, frame: DeviceFrame) -> Result<(), String> {
+                match frame {
+                    DeviceFrame::$of(frame) => Self::set_frame(self, frame).map_err(|e| e.to_string()),
+                    #[cfg(feature = "gpu")]
+                    _ => Err("frame: found one of another device, expected one of this".into()),
+                }
             }
 
             fn set_lights(&mut self, lights: Vec<Light>) -> Result<(), String> {
@@ -55,9 +58,9 @@ macro_rules! marches {
     };
 }
 
-marches!(Renderer, |_| Vec::new());
+marches!(Renderer, Cpu, |_| Vec::new());
 #[cfg(feature = "gpu")]
-marches!(GpuRenderer, |renderer: &GpuRenderer| renderer.gpu().take_times());
+marches!(GpuRenderer, Gpu, |renderer: &GpuRenderer| renderer.gpu().take_times());
 
 /// What marches on `device`, under the lights and medium of `stage`.
 pub fn marcher(device: &Device, settings: RenderSettings, stage: &Stage) -> Result<Box<dyn Marcher>, String> {

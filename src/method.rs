@@ -1,7 +1,7 @@
 //! The methods that `render` and its kin make images by, treated alike: options in, a frame's image and its story out.
 
 use crate::cli::{MethodChoice, RenderArgs};
-use crate::devices::Device;
+use crate::devices::{Device, DeviceFrame};
 use crate::failure::Failure;
 use crate::marcher::{Marcher, marcher};
 use crate::staging::Stage;
@@ -11,7 +11,6 @@ use serde_json::{Value, json};
 use smoke_formats::pack::Pack;
 use smoke_runtime::film::Film;
 use smoke_runtime::light::Light;
-use smoke_runtime::medium::frame::Frame;
 use smoke_runtime::plan::choose::Settings;
 use smoke_runtime::renderer::{RenderSettings, Route, Seconds};
 use smoke_runtime::transport::reference::{ReferenceSettings, trace};
@@ -135,7 +134,7 @@ impl Method {
 
 impl Maker<'_> {
     /// The image of `frame`; `done` is told which part of it is finished, from 0 to 1.
-    pub fn image(&mut self, frame: Frame, done: &mut dyn FnMut(f64)) -> Result<Image, String> {
+    pub fn image(&mut self, frame: DeviceFrame, done: &mut dyn FnMut(f64)) -> Result<Image, String> {
         let start = Instant::now();
         match self {
             Self::Marched(marcher, stage) => {
@@ -152,7 +151,7 @@ impl Maker<'_> {
             Self::Reference(settings, stage) => {
                 let mut on_pass = |passes, error| done(reference::part_done(settings, passes, error));
                 let Stage { medium, lights, camera, .. } = stage;
-                let traced = trace(&frame.field, medium, lights, camera, settings, &mut on_pass);
+                let traced = trace(&frame.frame().field, medium, lights, camera, settings, &mut on_pass);
                 let traced = traced.map_err(|e| e.to_string())?;
                 let figures = reference::figures(&traced);
                 let seconds = vec![("trace", start.elapsed().as_secs_f64())];

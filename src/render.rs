@@ -4,11 +4,11 @@
 //! thread or many, the bytes are the same. All settings go into each image's `smokebake:settings`.
 
 use crate::cli::{Detail, RenderArgs};
-use crate::devices::Device;
+use crate::devices::{Device, DeviceFrame};
 use crate::method::{Image, Maker, Method};
 use crate::progress::Progress;
 use crate::staging::{SceneChanges, Stage};
-use crate::{answer, failure::Failure};
+use crate::{answer, failure::Failure, pipeline};
 use serde_json::{Value, json};
 use smoke_formats::Error;
 use smoke_formats::image::{self, FrameMetadata, RenderedFrame, SamplePrecision};
@@ -17,23 +17,16 @@ use smoke_formats::scene::Scene;
 use smoke_formats::sequence::OutputNames;
 use smoke_runtime::medium::frame::Frame;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Instant;
 
 /// What stages took, by name; wall seconds of different frames overlap.
 type Stages = Vec<(&'static str, f64)>;
 
-/// A frame, ready to be lit.
-struct Decoded {
+/// A frame where its device draws it from, ready to be lit.
+struct Prepared {
     position: usize,
-    frame: Frame,
-    seconds: f64,
-}
-
-/// An image that is not written yet.
-struct Made {
-    position: usize,
-    path: PathBuf,
-    image: Image,
+    frame: DeviceFrame,
     seconds: Stages,
 }
 
@@ -99,7 +92,7 @@ pub fn run(args: &RenderArgs) -> Result<(), Failure> {
     let reports = pool.install(|| -> Result<Vec<Report>, Failure> {
         let mut maker =
             method.maker(&stage, &device).map_err(|e| Failure::work(format!("{}: {e}", args.scene.display())))?;
-        job.sequence(&frames, |position| names.path(numbers[position]), &mut maker, &progress)
+        job.sequence(&frames, |position| names.path(numbers[position]), &mut maker, &device, &progress)
     })?;
     progress.finish();
     let megapixels = f64::from(scene.width) * f64::from(scene.height) * 1e-6;
@@ -138,58 +131,52 @@ pub fn document(method: &Method, detail: Detail, scene: &Scene) -> Value {
 }
 
 impl Job<'_> {
-    /// Makes and writes the images of `frames`. While one is made, the next frame is decoded and the image before is
-    /// written: a graphics device does not wait for the processor.
+    /// Makes and writes the images of `frames`. While one is made, the next frame is decoded and taken to the device, and the
+    /// image before is written: a graphics device does not wait for the processor.
     fn sequence(
         &self,
         frames: &[usize],
         path: impl Fn(usize) -> PathBuf + Sync,
         maker: &mut Maker,
+        device: &Device,
         progress: &Progress,
     ) -> Result<Vec<Report>, Failure> {
-        let mut reports = Vec::with_capacity(frames.len());
-        let mut decoded = frames.first().map(|&position| self.decode(position));
-        let mut before: Option<Made> = None;
-        for (turn, &position) in frames.iter().enumerate() {
-            let frame = decoded.take();
-            let (made, (next, written)) = rayon::join(
-                || frame.map(|frame| self.make(frame?, maker, progress)).transpose(),
-                || {
-                    let next = || frames.get(turn + 1).map(|&position| self.decode(position));
-                    rayon::join(next, || before.take().map(|made| self.finish(made)))
-                },
-            );
-            reports.extend(written.transpose()?);
-            before = made?.map(|(image, seconds)| Made { position, path: path(position), image, seconds });
-            decoded = next;
-        }
-        reports.extend(before.map(|made| self.finish(made)).transpose()?);
-        Ok(reports)
+        pipeline::run(
+            frames.len(),
+            |turn| self.prepare(frames[turn], device),
+            |_, prepared| self.make(prepared, maker, progress),
+            |turn, (image, seconds)| self.finish(frames[turn], path(frames[turn]), image, seconds),
+        )
     }
 
-    fn decode(&self, position: usize) -> Result<Decoded, Failure> {
+    fn prepare(&self, position: usize, device: &Device) -> Result<Prepared, Failure> {
         let start = Instant::now();
         let frame = read(self.pack, position, &self.method, self.detail)?;
-        Ok(Decoded { position, frame, seconds: start.elapsed().as_secs_f64() })
+        let mut seconds = vec![("decode", start.elapsed().as_secs_f64())];
+        let start = Instant::now();
+        let frame = device.take(Arc::new(frame)).map_err(|e| self.failure(position, e))?;
+        if device.is_graphics() {
+            seconds.push(("upload", start.elapsed().as_secs_f64()));
+        }
+        Ok(Prepared { position, frame, seconds })
     }
 
-    /// The image, and the seconds of decoding and of its stages.
-    fn make(&self, decoded: Decoded, maker: &mut Maker, progress: &Progress) -> Result<(Image, Stages), Failure> {
+    /// The image, and the seconds of the frame's stages so far.
+    fn make(&self, prepared: Prepared, maker: &mut Maker, progress: &Progress) -> Result<(Image, Stages), Failure> {
         let mut steps = 0;
         let mut advance = |part: f64| {
             let now = (part * STEPS as f64) as u64;
             progress.advance(now.saturating_sub(steps));
             steps = steps.max(now);
         };
-        let image = self.image(decoded.position, decoded.frame, maker, &mut advance)?;
+        let Prepared { position, frame, mut seconds } = prepared;
+        let image = self.image(position, frame, maker, &mut advance)?;
         advance(1.0);
-        let mut seconds = vec![("decode", decoded.seconds)];
         seconds.extend_from_slice(&image.seconds);
         Ok((image, seconds))
     }
 
-    fn finish(&self, made: Made) -> Result<Report, Failure> {
-        let Made { position, path, image, mut seconds } = made;
+    fn finish(&self, position: usize, path: PathBuf, image: Image, mut seconds: Stages) -> Result<Report, Failure> {
         let number = self.pack.frames()[position].frame;
         let start = Instant::now();
         let clamped = self.write(number, &image, &path)?;
@@ -202,13 +189,17 @@ impl Job<'_> {
     pub fn image(
         &self,
         position: usize,
-        frame: Frame,
+        frame: DeviceFrame,
         maker: &mut Maker,
         done: &mut dyn FnMut(f64),
     ) -> Result<Image, Failure> {
+        maker.image(frame, done).map_err(|e| self.failure(position, e))
+    }
+
+    /// What is wrong with the frame at `position`.
+    fn failure(&self, position: usize, message: String) -> Failure {
         let number = self.pack.frames()[position].frame;
-        let image = maker.image(frame, done);
-        image.map_err(|e| Failure::work(format!("{}: frame {number}: {e}", self.pack.path().display())))
+        Failure::work(format!("{}: frame {number}: {message}", self.pack.path().display()))
     }
 
     /// Writes the image of frame `number`; gives how many samples did not fit.

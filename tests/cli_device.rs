@@ -35,12 +35,12 @@ fn bake(folder: &Path, sequence: &str, pack: &str, frames: &str, more: &[&str]) 
     answer(folder, &[&line[..], &fit, more].concat());
 }
 
-/// Renders to `DEVICE.####.exr`.
-fn render(folder: &Path, pack: &str, device: &str, scene: &str, more: &[&str]) {
+/// Renders to `DEVICE.####.exr`; gives the answer.
+fn render(folder: &Path, pack: &str, device: &str, scene: &str, more: &[&str]) -> String {
     let output = format!("{device}.####.exr");
     let size = ["--width", "50", "--height", "60", "--float", "--progress", "none"];
     let line = ["render", pack, "--device", device, "--scene", scene, "-o", &output];
-    answer(folder, &[&line[..], &size, more].concat());
+    answer(folder, &[&line[..], &size, more].concat())
 }
 
 /// RMSE of all channels but depth over the RMS of the first; infinite if any is not a number.
@@ -87,6 +87,37 @@ fn no_frame_of_a_sequence_is_left_out_or_comes_twice() {
         }
     }
     eprintln!("{name}: {} GPU cases", FRAMES.count());
+}
+
+#[test]
+fn frames_that_are_uploaded_ahead_have_the_bytes_of_frames_in_turn_and_the_upload_is_a_stage() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let Some(name) = device(folder) else { return };
+    let scene = scene("turned");
+    let transfer = ["--transfer", "hat162", "--clusters", "16", "--photons", "1", "--medium", &scene];
+    bake(folder, PLUME, "p.smoke", "5-7", &transfer);
+    let grid = ["--method", "compensated", "--order", "single", "--beams", "16"];
+    for method in [&grid[..], &["--method", "transfer"]] {
+        let seconds = |device: &str, more: &[&str]| -> Vec<Value> {
+            let line = [method, &["--json"], more].concat();
+            let told: Value = serde_json::from_str(&render(folder, "p.smoke", device, &scene, &line)).unwrap();
+            told["frames"].as_array().unwrap().iter().map(|frame| frame["seconds"].clone()).collect()
+        };
+        let bytes = |frame: i32| std::fs::read(folder.join(format!("gpu.{frame:04}.exr"))).unwrap();
+        // On one thread a frame is uploaded when the one before it is done; alone, nothing is beside it.
+        let images =
+            [&["--threads", "1"][..], &["--threads", "2"], &["--threads", "2", "--frames", "6,7"]].map(|more| {
+                let seconds = seconds("gpu", more);
+                assert!(seconds.iter().all(|s| s["upload"].as_f64().is_some_and(|s| s >= 0.0)), "{seconds:?}");
+                assert!(seconds.iter().all(|s| s["decode"].is_number() && s["view_pass"].is_number()), "{seconds:?}");
+                (5..=7).map(bytes).collect::<Vec<_>>()
+            });
+        assert!(images[0] == images[1] && images[1] == images[2], "{method:?}");
+        assert!(images[0][0] != images[0][1] && images[0][1] != images[0][2]);
+        assert!(seconds("cpu", &["--frames", "6"]).iter().all(|s| s["decode"].is_number() && s["upload"].is_null()));
+    }
+    eprintln!("{name}: 12 GPU cases");
 }
 
 #[test]

@@ -145,7 +145,7 @@ pub struct Seconds {
 
 /// The frame with what depends on it alone.
 struct Loaded {
-    frame: Frame,
+    frame: Arc<Frame>,
     transport: Transport,
     /// Its bricks; made for the first image.
     volume: Option<ShadedVolume>,
@@ -190,7 +190,8 @@ impl Renderer {
     }
 
     /// Another frame.
-    pub fn set_frame(&mut self, frame: Frame) -> Result<(), RenderError> {
+    pub fn set_frame(&mut self, frame: impl Into<Arc<Frame>>) -> Result<(), RenderError> {
+        let frame = frame.into();
         (self.source, self.shaded, self.loaded) = (None, None, None);
         let transport = match self.settings.route {
             Route::Grid(settings) => {

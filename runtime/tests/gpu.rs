@@ -11,6 +11,7 @@ use smoke_runtime::camera::Camera;
 use smoke_runtime::gpu::device::{Choice, ForcedLimits, Gpu, GpuError};
 use smoke_runtime::gpu::march::{self, DeviceSky, MarchPass};
 use smoke_runtime::gpu::renderer::{GpuRenderError, GpuRenderer, SolveOn};
+use smoke_runtime::gpu::upload::UploadedFrame;
 use smoke_runtime::gpu::volume::DeviceVolume;
 use smoke_runtime::gpu::volume_pass::{self, DeviceSource, VolumePass};
 use smoke_runtime::light::{Environment, Light, beams};
@@ -184,7 +185,7 @@ fn images_agree_after_every_kind_of_edit_and_with_pages_of_few_bricks() {
         let (field, other) = (plume(6), tiny());
         let camera = cameras(&field);
         let mut cpu = Renderer::new(settings, medium(0.4), sky()).unwrap();
-        let mut device = GpuRenderer::new(gpu, settings, medium(0.4), sky(), solve_on).unwrap();
+        let mut device = GpuRenderer::new(Arc::clone(&gpu), settings, medium(0.4), sky(), solve_on).unwrap();
         let mut same = |cpu: &mut Renderer, device: &mut GpuRenderer, camera: &Camera, what: &str| {
             let (expected, a) = cpu.render(camera).unwrap();
             let (found, b) = device.render(camera).unwrap();
@@ -194,7 +195,7 @@ fn images_agree_after_every_kind_of_edit_and_with_pages_of_few_bricks() {
             cases += 1;
         };
         cpu.set_frame(frame(field.clone())).unwrap();
-        device.set_frame(frame(field)).unwrap();
+        device.set_frame(UploadedFrame::new(&gpu, frame(field)).unwrap()).unwrap();
         same(&mut cpu, &mut device, &camera[0], "first");
         same(&mut cpu, &mut device, &camera[2], "another eye");
         let light = vec![sky().remove(1)];
@@ -206,7 +207,7 @@ fn images_agree_after_every_kind_of_edit_and_with_pages_of_few_bricks() {
         same(&mut cpu, &mut device, &camera[2], "a medium with a peak");
         let camera = cameras(&other);
         cpu.set_frame(frame(other.clone())).unwrap();
-        device.set_frame(frame(other)).unwrap();
+        device.set_frame(UploadedFrame::new(&gpu, frame(other)).unwrap()).unwrap();
         same(&mut cpu, &mut device, &camera[0], "another frame");
     }
     told(cases);
@@ -218,15 +219,16 @@ fn what_a_device_cannot_hold_or_do_is_refused_by_name() {
     assert_eq!(gpu.summary().storage_binding, 64 << 10);
     let mut renderer =
         GpuRenderer::new(Arc::clone(&gpu), RenderSettings::default(), medium(0.0), sky(), SolveOn::Device).unwrap();
-    let field = plume(1);
-    let camera = cameras(&field)[0];
-    renderer.set_frame(frame(field)).unwrap();
-    let error = renderer.render(&camera).unwrap_err();
+    let mut show = |field: DensityField| -> Result<(), GpuRenderError> {
+        let camera = cameras(&field)[0];
+        renderer.set_frame(UploadedFrame::new(&gpu, frame(field))?)?;
+        renderer.render(&camera).map(|_| ())
+    };
+    let error = show(plume(1)).unwrap_err();
     assert!(matches!(error, GpuRenderError::Gpu(GpuError::Limit { limit: 65536, .. })), "{error}");
     assert!(error.to_string().ends_with("use --device cpu"), "{error}");
     // The device serves on: a frame that fits is shown.
-    renderer.set_frame(frame(tiny())).unwrap();
-    renderer.render(&cameras(&tiny())[0]).unwrap();
+    show(tiny()).unwrap();
 
     let error = Gpu::open(&Choice::Named("no such thing".into()), ForcedLimits::default()).err().unwrap();
     assert!(matches!(&error, GpuError::NoDevice { found, .. } if !found.is_empty()), "{error}");
@@ -273,7 +275,7 @@ fn a_lost_device_is_an_error_that_says_what_to_do() {
     let Some(gpu) = device(ForcedLimits::default()) else { return };
     let mut renderer =
         GpuRenderer::new(Arc::clone(&gpu), RenderSettings::default(), medium(0.0), sky(), SolveOn::Device).unwrap();
-    renderer.set_frame(frame(tiny())).unwrap();
+    renderer.set_frame(UploadedFrame::new(&gpu, frame(tiny())).unwrap()).unwrap();
     gpu.parts().0.destroy();
     let error = renderer.render(&cameras(&tiny())[0]).unwrap_err();
     assert!(error.to_string().contains("--device cpu"), "{error}");

@@ -10,6 +10,7 @@ use smoke_runtime::gpu::centre_solve::{DEPTH, DeviceKernels, PRODUCT, SINGLE};
 use smoke_runtime::gpu::centres::{self, CentrePass, DeviceCentres};
 use smoke_runtime::gpu::device::{ForcedLimits, Gpu};
 use smoke_runtime::gpu::renderer::{GpuRenderer, SolveOn};
+use smoke_runtime::gpu::upload::UploadedFrame;
 use smoke_runtime::gpu::volume::DeviceVolume;
 use smoke_runtime::light::Light;
 use smoke_runtime::medium::field::DensityField;
@@ -169,7 +170,7 @@ fn images_through_the_centres_agree_after_every_kind_of_edit() {
         };
         let clone = |f: &Frame| Frame { field: f.field.clone(), gaussians: f.gaussians.clone(), transfer: None, ..*f };
         cpu.set_frame(clone(&first)).unwrap();
-        device.set_frame(clone(&first)).unwrap();
+        device.set_frame(UploadedFrame::new(&gpu, clone(&first)).unwrap()).unwrap();
         same(&mut cpu, &mut device, 0, "first");
         same(&mut cpu, &mut device, 2, "another eye");
         let light: Vec<Light> = vec![sky().remove(1)];
@@ -180,7 +181,7 @@ fn images_through_the_centres_agree_after_every_kind_of_edit() {
         device.set_medium(medium(0.7)).unwrap();
         same(&mut cpu, &mut device, 3, "another medium");
         cpu.set_frame(clone(&other)).unwrap();
-        device.set_frame(clone(&other)).unwrap();
+        device.set_frame(UploadedFrame::new(&gpu, clone(&other)).unwrap()).unwrap();
         same(&mut cpu, &mut device, 0, "another frame");
         assert_eq!(camera.len(), 4);
     }

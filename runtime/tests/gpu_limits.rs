@@ -14,6 +14,7 @@ use smoke_runtime::gpu::device::ForcedLimits;
 use smoke_runtime::gpu::march::{self as gpu_march, DeviceSky, MarchPass};
 use smoke_runtime::gpu::pass::PRELUDE;
 use smoke_runtime::gpu::renderer::{GpuRenderer, SolveOn};
+use smoke_runtime::gpu::upload::UploadedFrame;
 use smoke_runtime::gpu::volume::DeviceVolume;
 use smoke_runtime::gpu::{centre_solve, centres, decode, gmres, scatter, single, transfer, volume_pass};
 use smoke_runtime::march::{self, MarchMedium, MarchSettings};
@@ -62,8 +63,9 @@ fn a_frame_above_64_mib_is_shown_in_pages_and_its_image_does_not_depend_on_them(
         assert!(binding.is_none() || used == 4, "{used} pages");
         assert!(binding.is_none() || volume.pages.iter().all(|page| page.size() <= BINDING));
         drop(volume);
+        let frame = UploadedFrame::new(&gpu, frame(field.clone())).unwrap();
         let mut renderer = GpuRenderer::new(gpu, settings, medium, sky(), SolveOn::Processor).unwrap();
-        renderer.set_frame(frame(field.clone())).unwrap();
+        renderer.set_frame(frame).unwrap();
         let (film, seconds) = renderer.render(&camera).unwrap();
         eprintln!("binding {binding:?}, {used} pages: {seconds:?}");
         images.push(radiance(&film));

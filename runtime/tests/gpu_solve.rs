@@ -14,6 +14,7 @@ use smoke_runtime::gpu::renderer::{GpuRenderer, SolveOn};
 use smoke_runtime::gpu::scatter::{self, ScatterPass};
 use smoke_runtime::gpu::single::{self, SinglePass};
 use smoke_runtime::gpu::sweep_grid::DeviceSweepGrid;
+use smoke_runtime::gpu::upload::UploadedFrame;
 use smoke_runtime::light::{Beam, Environment, Light, beams};
 use smoke_runtime::medium::field::DensityField;
 use smoke_runtime::medium::frame::Frame;
@@ -338,7 +339,7 @@ fn images_agree_for_a_sun_a_sky_both_and_darkness() {
         let mut cpu = Renderer::new(settings, coloured(0.0), vec![]).unwrap();
         let mut device = GpuRenderer::new(gpu.clone(), settings, coloured(0.0), vec![], SolveOn::Device).unwrap();
         cpu.set_frame(frame(field.clone())).unwrap();
-        device.set_frame(frame(field.clone())).unwrap();
+        device.set_frame(UploadedFrame::new(&gpu, frame(field.clone())).unwrap()).unwrap();
         for (lights, medium) in [
             (vec![], coloured(0.3)),
             (vec![sky().remove(1)], coloured(0.5)),
@@ -382,7 +383,7 @@ fn images_of_the_real_plume_agree_in_three_scenes() {
         let mut cpu = Renderer::new(settings, grey(0.0), vec![]).unwrap();
         let mut device = GpuRenderer::new(gpu.clone(), settings, grey(0.0), vec![], SolveOn::Device).unwrap();
         cpu.set_frame(frame(field.clone())).unwrap();
-        device.set_frame(frame(field.clone())).unwrap();
+        device.set_frame(UploadedFrame::new(&gpu, frame(field.clone())).unwrap()).unwrap();
         for (name, lights, medium) in [
             ("sun, g = 0.85", vec![sky().remove(1)], grey(0.85)),
             ("sky, g = 0", vec![sky().remove(0)], grey(0.0)),

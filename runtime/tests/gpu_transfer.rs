@@ -9,6 +9,8 @@ use smoke_formats::gaussian::UnitSpace;
 use smoke_runtime::gpu::device::{ForcedLimits, Gpu, GpuError};
 use smoke_runtime::gpu::renderer::{GpuRenderError, GpuRenderer, SolveOn};
 use smoke_runtime::gpu::transfer::{CELLS, DeviceTransfer, PRODUCT, SOURCE, TransferPass, VIEW_DIRECTIONS};
+use smoke_runtime::gpu::transfer_rows::DeviceRows;
+use smoke_runtime::gpu::upload::UploadedFrame;
 use smoke_runtime::gpu::volume::DeviceVolume;
 use smoke_runtime::light::Light;
 use smoke_runtime::medium::field::DensityField;
@@ -153,7 +155,7 @@ impl<'a> Case<'a> {
         let Self { gpu, pass, field, transfer, lights } = self;
         let source = self.transport().light(field, lights, ScatteringOrder::All);
         let expected = DeviceVolume::of_shaded(gpu, &shaded(&source, field, eye)).unwrap().read(gpu).unwrap();
-        let frame = DeviceTransfer::new(gpu, &source, field).unwrap();
+        let frame = DeviceTransfer::new(gpu, Arc::new(DeviceRows::new(gpu, field, transfer).unwrap())).unwrap();
         let light = pass.light(gpu, &frame, &source).unwrap();
         let volume = DeviceVolume::of_field(gpu, field).unwrap();
         let density = gpu.upload("density", &field.values).unwrap();
@@ -326,7 +328,7 @@ fn images_by_transfer_agree_after_every_kind_of_edit() {
             };
         for field in [plume(6), tiny()] {
             cpu.set_frame(frame(field.clone(), medium)).unwrap();
-            device.set_frame(frame(field.clone(), medium)).unwrap();
+            device.set_frame(UploadedFrame::new(&gpu, frame(field.clone(), medium)).unwrap()).unwrap();
             same(&mut cpu, &mut device, &field, 0, "first");
             same(&mut cpu, &mut device, &field, 2, "another eye");
             let sun = Light::Directional { toward: Vec3::new(0.0, 0.6, 0.8), irradiance: [3.0, 2.5, 2.0] };
@@ -341,13 +343,45 @@ fn images_by_transfer_agree_after_every_kind_of_edit() {
 }
 
 #[test]
+fn renderers_that_share_an_uploaded_transfer_draw_what_each_draws_alone() {
+    let Some(gpu) = device(ForcedLimits::default()) else { return };
+    let settings = RenderSettings { route: Route::Transfer(TransferSettings::default()), ..RenderSettings::default() };
+    let (field, medium) = (plume(6), coloured(0.5));
+    let bare = Frame { transfer: None, ..frame(field.clone(), medium) };
+    let bare = UploadedFrame::new(&gpu, bare).unwrap();
+    let uploaded = Arc::new(UploadedFrame::new(&gpu, frame(field.clone(), medium)).unwrap());
+    assert!(uploaded.bytes() > bare.bytes() + 4 * field.values.len() as u64, "rows of the nodes are uploaded too");
+    let draw = |light: usize| {
+        let lights = vec![sky().remove(light)];
+        let mut renderer = GpuRenderer::new(Arc::clone(&gpu), settings, medium, lights, SolveOn::Device).unwrap();
+        renderer.set_frame(Arc::clone(&uploaded)).unwrap();
+        (0..3).map(|eye| radiance(&renderer.render(&cameras(&field)[eye]).unwrap().0)).collect::<Vec<_>>()
+    };
+    let alone = [0, 1].map(draw);
+    assert!(alone[0][0] != alone[1][0]);
+    let draw = &draw;
+    let together = std::thread::scope(|scope| {
+        [0, 1].map(|light| scope.spawn(move || draw(light))).map(|drawn| drawn.join().unwrap())
+    });
+    assert!(together == alone);
+    // One of another density is refused before it is copied.
+    let other = Frame { field: tiny(), ..frame(field.clone(), medium) };
+    let error = UploadedFrame::new(&gpu, other).map(|_| ()).unwrap_err();
+    assert!(error.to_string().contains("transfer: direct light has"), "{error}");
+    told(3);
+}
+
+#[test]
 fn a_transfer_that_a_device_cannot_hold_is_refused_by_name() {
     let Some(gpu) = device(ForcedLimits { storage_binding: Some(64 << 10) }) else { return };
     let settings = RenderSettings { route: Route::Transfer(TransferSettings::default()), ..RenderSettings::default() };
-    let mut renderer = GpuRenderer::new(gpu, settings, grey(0.5), sky(), SolveOn::Device).unwrap();
+    let mut renderer = GpuRenderer::new(Arc::clone(&gpu), settings, grey(0.5), sky(), SolveOn::Device).unwrap();
     let field = plume(1);
-    renderer.set_frame(frame(field.clone(), grey(0.5))).unwrap();
-    let error = renderer.render(&cameras(&field)[0]).unwrap_err();
+    let mut show = || -> Result<(), GpuRenderError> {
+        renderer.set_frame(UploadedFrame::new(&gpu, frame(field.clone(), grey(0.5)))?)?;
+        renderer.render(&cameras(&field)[0]).map(|_| ())
+    };
+    let error = show().unwrap_err();
     assert!(matches!(error, GpuRenderError::Gpu(GpuError::Limit { limit: 65536, .. })), "{error}");
     assert!(error.to_string().ends_with("use --device cpu"), "{error}");
     told(1);

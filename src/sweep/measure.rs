@@ -3,7 +3,7 @@
 use super::store::ReferenceImage;
 use super::table::{Progressed, ReferenceFigures, Seconds};
 use crate::cli::Detail;
-use crate::devices::Device;
+use crate::devices::{Device, DeviceFrame};
 use crate::failure::Failure;
 use crate::method::Method;
 use crate::staging::Stage;
@@ -18,6 +18,7 @@ use smoke_runtime::image_difference::{self, Incomparable, Noise, Pair, false_col
 use smoke_runtime::medium::field::DensityField;
 use smoke_runtime::renderer::RenderError;
 use smoke_runtime::transport::reference::{ReferenceSettings, trace};
+use std::sync::Arc;
 use std::time::Instant;
 
 /// Error at which the false colours of a difference are full, relative to the root mean square of the reference.
@@ -93,7 +94,7 @@ pub fn render(
         let start = Instant::now();
         let frame = render::read(pack, position, method, detail)?;
         let decode = ("decode", start.elapsed().as_secs_f64());
-        match maker.image(frame, &mut |_| {}) {
+        match maker.image(DeviceFrame::Cpu(Arc::new(frame)), &mut |_| {}) {
             Ok(image) => runs.push((Seconds::new([decode].into_iter().chain(image.seconds)), image.film)),
             Err(why) => return Ok(Err(why)),
         }

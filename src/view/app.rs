@@ -162,7 +162,7 @@ impl App {
         let Opened { pack, state } = opened;
         let with_transfer = state.method == MethodChoice::Transfer;
         Self {
-            playback: Playback::start(pack.clone(), with_transfer, state.position, waker(&ctx)),
+            playback: Playback::start(pack.clone(), with_transfer, device.clone(), state.position, waker(&ctx)),
             fps: pack.sequence().frames_per_second.unwrap_or(FPS),
             waits: 0,
             shown: None,
@@ -327,19 +327,19 @@ impl App {
     fn restart_playback(&mut self) {
         self.with_transfer = self.state.method == MethodChoice::Transfer;
         let ctx = self.ctx.clone();
-        let (pack, position) = (self.pack.clone(), self.state.position);
-        self.playback = Playback::start(pack, self.with_transfer, position, move || ctx.request_repaint());
+        let (pack, device, position) = (self.pack.clone(), self.device.clone(), self.state.position);
+        self.playback = Playback::start(pack, self.with_transfer, device, position, move || ctx.request_repaint());
         self.asked.seen = None;
         self.solved = None;
     }
 
-    /// Moves on to the frame that the time asks for, once it is decoded.
+    /// Moves on to the frame that the time asks for, once it is there.
     fn play(&mut self) {
         let Some(Playing { since, from }) = &self.playing else { return };
         let steps = (since.elapsed().as_secs_f64() * self.fps) as usize;
         let wanted = (from + steps) % self.playback.count().max(1);
         if wanted != self.state.position {
-            if self.playback.at(wanted).is_some() {
+            if self.playback.has(wanted) {
                 self.state.position = wanted;
             } else {
                 // From the next frame on again, when it comes.

@@ -6,7 +6,7 @@
 //! | `framing` | first camera, medium and light from the data |
 //! | `state` | what the user edits: a scene, a frame, a method, an exposure |
 //! | `orbit` | the mouse moves the camera |
-//! | `playback` | frames decoded ahead |
+//! | `playback` | frames decoded and uploaded ahead |
 //! | `painter` | a stage into pictures, pass after pass |
 //! | `worker` | threads on which the newest request wins |
 //! | `tone` | a film into bytes |

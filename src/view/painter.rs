@@ -3,14 +3,13 @@
 //! A painter keeps what its renderer was last told, and tells it only what is new, so that an edit costs what it must: a
 //! camera that moves is a march alone.
 
-use crate::devices::Device;
+use crate::devices::{Device, DeviceFrame};
 use crate::marcher::{Marcher, marcher};
 use crate::method::Method;
 use crate::staging::Stage;
 use smoke_formats::scene;
 use smoke_runtime::camera::Camera;
 use smoke_runtime::film::Film;
-use smoke_runtime::medium::frame::Frame;
 use smoke_runtime::renderer::{RenderSettings, Seconds};
 use smoke_runtime::transport::reference::{ReferenceSettings, trace};
 use std::sync::Arc;
@@ -62,7 +61,7 @@ struct Told {
     up: scene::UpAxis,
     lights: Vec<scene::Light>,
     medium: scene::Medium,
-    frame: Arc<Frame>,
+    frame: DeviceFrame,
 }
 
 /// See the module's head.
@@ -83,7 +82,7 @@ impl Painter {
         &mut self,
         method: &Method,
         stage: &Stage,
-        frame: &Arc<Frame>,
+        frame: &DeviceFrame,
         camera: &Camera,
         pass: u32,
     ) -> Result<Pass, String> {
@@ -101,7 +100,8 @@ impl Painter {
                 let passes = TRACED[(pass as usize).min(TRACED.len() - 1)];
                 let seed = settings.seed.wrapping_add(u64::from(pass));
                 let settings = ReferenceSettings { target_error: 0.0, max_passes: passes, seed, ..*settings };
-                let traced = trace(&frame.field, &stage.medium, &stage.lights, camera, &settings, &mut |_, _| {});
+                let traced =
+                    trace(&frame.frame().field, &stage.medium, &stage.lights, camera, &settings, &mut |_, _| {});
                 let film = traced.map_err(|e| e.to_string())?.film;
                 let stages = Stages { wall: vec![("trace", start.elapsed().as_secs_f64())], device: Vec::new() };
                 Ok(Pass { film, weight: passes, stages })
@@ -109,11 +109,11 @@ impl Painter {
         }
     }
 
-    fn tell(&mut self, settings: RenderSettings, stage: &Stage, frame: &Arc<Frame>) -> Result<Told, String> {
+    fn tell(&mut self, settings: RenderSettings, stage: &Stage, frame: &DeviceFrame) -> Result<Told, String> {
         let scene = &stage.scene;
         let Some(mut told) = self.told.take().filter(|told| told.settings == settings) else {
             let mut marcher = marcher(&self.device, settings, stage)?;
-            marcher.set_frame(Frame::clone(frame))?;
+            marcher.set_frame(frame.clone())?;
             let (lights, medium) = (scene.lights.clone(), scene.medium.clone());
             return Ok(Told { settings, marcher, up: scene.up, lights, medium, frame: frame.clone() });
         };
@@ -125,8 +125,8 @@ impl Painter {
             told.marcher.set_lights(stage.lights.clone())?;
             (told.lights, told.up) = (scene.lights.clone(), scene.up);
         }
-        if !Arc::ptr_eq(&told.frame, frame) {
-            told.marcher.set_frame(Frame::clone(frame))?;
+        if !Arc::ptr_eq(told.frame.frame(), frame.frame()) {
+            told.marcher.set_frame(frame.clone())?;
             told.frame = frame.clone();
         }
         Ok(told)
@@ -139,6 +139,7 @@ mod tests {
     use crate::testing::{small_pack, stage};
     use smoke_formats::pack::Pack;
     use smoke_formats::scene::{Camera as SceneCamera, Light as SceneLight, Scene, Sky};
+    use smoke_runtime::medium::frame::Frame;
 
     fn stage_of(scene: Scene) -> Stage {
         Stage::with(scene, &mut |_| unreachable!("no images")).unwrap()
@@ -159,7 +160,7 @@ mod tests {
         let path = folder.path().join("a.smoke");
         small_pack(&path, &[1, 2], 0.01);
         let pack = Pack::open(&path).unwrap();
-        let frames = [0, 1].map(|i| Arc::new(Frame::read(&pack, i).unwrap()));
+        let frames = [0, 1].map(|i| DeviceFrame::Cpu(Arc::new(Frame::read(&pack, i).unwrap())));
         let mut edits: Vec<(Scene, usize)> = vec![(scene(), 0)];
         let mut edit = |frame, change: &dyn Fn(&mut Scene)| {
             let mut scene = edits.last().unwrap().0.clone();
@@ -190,7 +191,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.smoke");
         small_pack(&path, &[1], 0.01);
-        let frame = Arc::new(Frame::read(&Pack::open(&path).unwrap(), 0).unwrap());
+        let frame = DeviceFrame::Cpu(Arc::new(Frame::read(&Pack::open(&path).unwrap(), 0).unwrap()));
         let method = Method::Compensated(RenderSettings::default());
         let (good, mut bad) = (stage_of(scene()), scene());
         bad.lights.push(SceneLight::Point { position: [0.0; 3], intensity: [1.0; 3] });

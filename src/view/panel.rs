@@ -256,6 +256,10 @@ fn time(app: &mut App, ui: &mut Ui) {
     let (decoded, kept) = app.playback.fill();
     let waits = app.waits;
     row(ui, "Decoded", |ui| text(ui, format!("{decoded} of {kept} frames, {waits} waited for")));
+    if app.device.is_graphics() {
+        let ready = app.playback.ready();
+        row(ui, "Uploaded", |ui| text(ui, format!("{ready} of them")));
+    }
 }
 
 /// What a button of the timeline shows; the fonts have no such signs.

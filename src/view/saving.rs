@@ -5,7 +5,7 @@
 
 use super::tone;
 use crate::cli::Detail;
-use crate::devices::Device;
+use crate::devices::{Device, DeviceFrame};
 use crate::failure::Failure;
 use crate::method::Method;
 use crate::render::{self, Job};
@@ -57,7 +57,7 @@ impl Saving {
         let frame = render::read(&self.pack, self.position, &method, Detail::Full)?;
         let mut maker =
             method.maker(&stage, &Device::Cpu).map_err(|e| Failure::work(format!("{}: {e}", scene_path.display())))?;
-        let image = job.image(self.position, frame, &mut maker, &mut |_| {})?;
+        let image = job.image(self.position, DeviceFrame::Cpu(Arc::new(frame)), &mut maker, &mut |_| {})?;
         job.write(number, &image, &exr)?;
         image::write_png(&png, &tone::picture(&image.film, self.stops))?;
         Ok(scene_path)

@@ -7,7 +7,7 @@
 //! points have one in each of 4^k equal squares of the pixel.
 
 use super::painter::{Painter, Stages};
-use crate::devices::Device;
+use crate::devices::{Device, DeviceFrame};
 use crate::failure::Failure;
 use crate::method::Method;
 use crate::staging::{Stage, read_sky};
@@ -15,7 +15,6 @@ use smoke_formats::image::RgbImage;
 use smoke_formats::scene::Scene;
 use smoke_runtime::camera::Camera;
 use smoke_runtime::film::Film;
-use smoke_runtime::medium::frame::Frame;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, Sender, TryRecvError, channel};
@@ -35,8 +34,8 @@ pub struct Request {
     pub serial: u64,
     /// Camera, lights, medium, and the size of the picture.
     pub scene: Scene,
-    /// The smoke.
-    pub frame: Arc<Frame>,
+    /// The smoke, where the device of the pictures draws it from.
+    pub frame: DeviceFrame,
     /// How.
     pub method: Method,
     /// True while more changes are expected.
@@ -303,6 +302,7 @@ mod tests {
     use smoke_formats::pack::Pack;
     use smoke_formats::scene::{Light, Sky};
     use smoke_runtime::film::Pixel;
+    use smoke_runtime::medium::frame::Frame;
     use smoke_runtime::renderer::{RenderSettings, Renderer};
     use std::collections::BTreeSet;
     use std::time::{Duration, Instant};
@@ -311,7 +311,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.smoke");
         small_pack(&path, &[1], 0.01);
-        let frame = Arc::new(Frame::read(&Pack::open(&path).unwrap(), 0).unwrap());
+        let frame = DeviceFrame::Cpu(Arc::new(Frame::read(&Pack::open(&path).unwrap(), 0).unwrap()));
         let mut scene = stage().scene;
         (scene.camera.position, scene.camera.target) = ([7.0, -6.0, 3.5], [7.0, 1.7, 3.5]);
         let sky = Sky::Color([1.0, 0.5, 0.25]);
@@ -338,7 +338,7 @@ mod tests {
         let first = wait(&worker).map_err(|e| e.1).unwrap();
         let stage = Stage::with(request.scene, &mut |_| unreachable!()).unwrap();
         let mut renderer = Renderer::new(RenderSettings::default(), stage.medium, stage.lights.clone()).unwrap();
-        renderer.set_frame((*request.frame).clone()).unwrap();
+        renderer.set_frame(request.frame.frame().clone()).unwrap();
         assert_eq!((*first.film).clone(), renderer.render(&stage.camera).unwrap().0);
         assert_eq!((first.passes, first.of, first.stages.wall.len()), (1, PASSES[0], 3));
         let mut last = first;

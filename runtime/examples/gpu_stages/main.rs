@@ -17,6 +17,7 @@ use smoke_formats::gaussian::{Gaussian, UnitSpace};
 use smoke_runtime::camera::Camera;
 use smoke_runtime::gpu::device::{Choice, ForcedLimits, Gpu};
 use smoke_runtime::gpu::renderer::{GpuRenderer, SolveOn};
+use smoke_runtime::gpu::upload::UploadedFrame;
 use smoke_runtime::light::Light;
 use smoke_runtime::medium::field::DensityField;
 use smoke_runtime::medium::frame::Frame;
@@ -107,7 +108,8 @@ fn measured(gpu: &Arc<Gpu>, at: (usize, [usize; 2])) {
         let settings = RenderSettings { route, ..RenderSettings::default() };
         let new = GpuRenderer::new(gpu.clone(), settings, made_up::medium(G), lights(0.0), SolveOn::Device);
         let mut renderer = new.expect("the device serves");
-        renderer.set_frame(frame(&field)).expect("the frame is good");
+        let uploaded = UploadedFrame::new(gpu, frame(&field)).expect("the device holds the frame");
+        renderer.set_frame(uploaded).expect("the frame is good");
         let mut wall = Vec::new();
         for turn in 0..2 {
             renderer.set_lights(lights(0.1 * f64::from(turn))).expect("lights are good");

@@ -85,7 +85,7 @@ impl CentrePass {
             let uniform = Uniform {
                 eye: eye.as_vec3().extend(0.0).to_array(),
                 dims: wide(field.dims),
-                bricks: wide(volume.bricks),
+                bricks: wide(volume.table.bricks),
                 first_brick: first_brick as u32,
                 page_bricks: bricks as u32,
                 count: source.count as u32,
@@ -99,7 +99,7 @@ impl CentrePass {
             .zip(&uniforms)
             .map(|(&page, uniform)| {
                 let of_source = [&source.gaussians, &source.weights, &source.radiance, &source.axes];
-                let mut buffers = vec![(0, uniform), (1, &volume.dense_bricks)];
+                let mut buffers = vec![(0, uniform), (1, &volume.table.dense_bricks)];
                 buffers.extend((2..).zip(of_source));
                 buffers.extend([(6, density), (7, &volume.pages[page])]);
                 buffers

@@ -140,7 +140,7 @@ impl MarchPass {
             };
             let uniform = gpu.uniform("march", &uniform);
             let [a, b, c, d] = [0, 1, 2, 3].map(|page| &volume.pages[page]);
-            let inputs = [&uniform, &volume.places, a, b, c, d, &sky.environments, &sky.texels, &out];
+            let inputs = [&uniform, &volume.table.places, a, b, c, d, &sky.environments, &sky.texels, &out];
             let buffers: Vec<(u32, &wgpu::Buffer)> = (0..).zip(inputs).collect();
             let step = Step { kernel: &self.kernel, buffers: &buffers, threads: pixels.len() as u32 };
             gpu.dispatch("view pass", &[step])?;
@@ -165,10 +165,10 @@ fn placed(
     sky: &DeviceSky,
     settings: &MarchSettings,
 ) -> March {
-    let node_from_world = volume.world_from_node.inverse();
-    let ds = sample_distance(&volume.world_from_node, volume.density_max, settings.step, medium.sigma_t);
-    let top = volume.dims.map(|n| (n - 1) as f64);
-    let middle = volume.world_from_node.transform_point3(DVec3::from_array(top) * 0.5);
+    let node_from_world = volume.table.world_from_node.inverse();
+    let ds = sample_distance(&volume.table.world_from_node, volume.table.density_max, settings.step, medium.sigma_t);
+    let top = volume.table.dims.map(|n| (n - 1) as f64);
+    let middle = volume.table.world_from_node.transform_point3(DVec3::from_array(top) * 0.5);
     // An eye past the middle counts from itself.
     let plane = (middle - camera.position).dot(camera.forward).max(0.0);
     let samples = (plane / ds).min(f64::from(1 << 30));
@@ -193,7 +193,7 @@ fn placed(
         sigma_t: wide(medium.sigma_t, 0.0),
         peak_ratio: wide(medium.peak_ratio, 1.0),
         top: wide(top.map(|t| t as f32), 0.0),
-        bricks: [volume.bricks[0] as u32, volume.bricks[1] as u32, volume.bricks[2] as u32, 0],
+        bricks: [volume.table.bricks[0] as u32, volume.table.bricks[1] as u32, volume.table.bricks[2] as u32, 0],
         size: size.map(|n| n as u32),
         first_pixel: 0,
         pixels: 0,

@@ -1,8 +1,9 @@
 //! The calls of [`Renderer`], with the grid route, transfer and the view pass on a device.
 //!
 //! Decoding is the processor's, and so is the projection of light onto transfer, whose result is copied. The
-//! solution at centres is the solver's, with the device's kernels ([`super::centre_solve`]). Kept until an edit makes them void: grids, planes, clusters and their light, bricks and backdrop on the
-//! device. So other light costs sweeps and solve, another view the volume pass and the march.
+//! solution at centres is the solver's, with the device's kernels ([`super::centre_solve`]). A frame comes as it was uploaded
+//! ([`UploadedFrame`]). Kept until an edit makes them void: grids, planes, light of clusters, nodes of bricks and backdrop on
+//! the device. So other light costs sweeps and solve, another view the volume pass and the march.
 
 use super::centre_solve::DeviceKernels;
 use super::centres::{CentrePass, DeviceCentres};
@@ -11,6 +12,7 @@ use super::grid_solve::{DeviceGrids, GridPass, GridProblem};
 use super::march::{DeviceSky, MarchPass};
 use super::self_test;
 use super::transfer::{DeviceLight, DeviceTransfer, TransferPass};
+use super::upload::UploadedFrame;
 use super::volume::DeviceVolume;
 use super::volume_pass::{DeviceSource, VolumePass};
 use crate::backdrop::Sky;
@@ -18,8 +20,6 @@ use crate::camera::Camera;
 use crate::film::Film;
 use crate::light::Light;
 use crate::march::{MarchMedium, MarchSettings};
-use crate::medium::field::DensityField;
-use crate::medium::frame::Frame;
 use crate::renderer::{Lit, RenderError, RenderSettings, Renderer, Seconds, Unlit};
 use crate::transport::compensated::grid::route::GridTransport;
 use crate::transport::medium::MediumParameters;
@@ -54,24 +54,20 @@ impl SolveOn {
     }
 }
 
-/// What depends on the frame alone.
+/// A frame with its nodes, for which there is room from its first image on.
 struct Loaded {
-    volume: DeviceVolume,
-    density: wgpu::Buffer,
+    frame: Arc<UploadedFrame>,
+    volume: Option<DeviceVolume>,
 }
 
 impl Loaded {
-    /// What `slot` holds of the frame, made now if it is empty: bricks, not yet shaded, and density are the same under any
-    /// light.
-    fn of<'a>(slot: &'a mut Option<Self>, gpu: &Gpu, field: &DensityField) -> Result<&'a Self, GpuError> {
-        let loaded = match slot.take() {
-            Some(loaded) => loaded,
-            None => {
-                let density = gpu.upload("density of the frame", &field.values)?;
-                Self { volume: DeviceVolume::of_field(gpu, field)?, density }
-            }
+    /// The frame's density, and the volume to shade.
+    fn density_and_volume(&mut self, gpu: &Gpu) -> Result<(&wgpu::Buffer, &DeviceVolume), GpuError> {
+        let volume = match self.volume.take() {
+            Some(volume) => volume,
+            None => DeviceVolume::new(gpu, Arc::clone(&self.frame.bricks))?,
         };
-        Ok(slot.insert(loaded))
+        Ok((&self.frame.density, self.volume.insert(volume)))
     }
 }
 
@@ -148,12 +144,15 @@ impl GpuRenderer {
         &self.gpu
     }
 
-    /// Another frame.
-    pub fn set_frame(&mut self, frame: Frame) -> Result<(), RenderError> {
+    /// Another frame, which this device holds.
+    pub fn set_frame(&mut self, frame: impl Into<Arc<UploadedFrame>>) -> Result<(), RenderError> {
+        let frame = frame.into();
         (self.source, self.centres, self.eye) = (None, None, None);
         (self.transfer, self.light, self.loaded) = (None, None, None);
         (self.grids, self.transport) = (DeviceGrids::default(), None);
-        self.solver.set_frame(frame)
+        self.solver.set_frame(Arc::clone(&frame.frame))?;
+        self.loaded = Some(Loaded { frame, volume: None });
+        Ok(())
     }
 
     /// Other lights.
@@ -181,14 +180,15 @@ impl GpuRenderer {
             None => self.shade(camera, &mut seconds)?,
         };
         let start = Instant::now();
-        let film = match (shaded, &self.loaded) {
-            (Some((medium, sky)), Some(loaded)) => {
+        let volume = self.loaded.as_ref().and_then(|loaded| loaded.volume.as_ref());
+        let film = match (shaded, volume) {
+            (Some((medium, sky)), Some(volume)) => {
                 let sky = match self.sky.take() {
                     Some(sky) => sky,
                     None => DeviceSky::new(&self.gpu, &sky)?,
                 };
                 let sky = self.sky.insert(sky);
-                self.march.film(&self.gpu, &loaded.volume, camera, &medium, sky, &self.march_settings)?
+                self.march.film(&self.gpu, volume, camera, &medium, sky, &self.march_settings)?
             }
             _ => Film::new(camera.width, camera.height),
         };
@@ -200,7 +200,9 @@ impl GpuRenderer {
     /// any frame.
     fn shade_grid(&mut self, camera: &Camera, seconds: &mut Seconds) -> Result<Option<Shaded>, GpuRenderError> {
         let start = Instant::now();
-        let Some(Unlit { problem, medium, sky }) = self.solver.unlit() else { return Ok(None) };
+        let (Some(Unlit { problem, medium, sky }), Some(loaded)) = (self.solver.unlit(), &mut self.loaded) else {
+            return Ok(None);
+        };
         let gpu = &*self.gpu;
         let source = match self.source.take() {
             Some(source) => source,
@@ -215,10 +217,9 @@ impl GpuRenderer {
         seconds.source_radiance = start.elapsed().as_secs_f64();
         let start = Instant::now();
         let eye = self.eye.take().filter(|&eye| eye == camera.position || !source.depends_on_view());
-        let loaded = Loaded::of(&mut self.loaded, gpu, problem.field)?;
+        let (density, volume) = loaded.density_and_volume(gpu)?;
         if eye.is_none() {
-            let density = (problem.field, &loaded.density);
-            self.volume_pass.shade(gpu, source, density, &loaded.volume, camera.position)?;
+            self.volume_pass.shade(gpu, source, (problem.field, density), volume, camera.position)?;
         }
         self.eye = Some(eye.unwrap_or(camera.position));
         seconds.volume_pass = start.elapsed().as_secs_f64();
@@ -228,7 +229,8 @@ impl GpuRenderer {
     /// The same for the other routes; none before any frame.
     fn shade(&mut self, camera: &Camera, seconds: &mut Seconds) -> Result<Option<Shaded>, GpuRenderError> {
         let start = Instant::now();
-        let Some(Lit { field, source, medium, sky, .. }) = self.solver.lit()? else {
+        let (Some(Lit { field, source, medium, sky, .. }), Some(loaded)) = (self.solver.lit()?, &mut self.loaded)
+        else {
             return Ok(None);
         };
         let gpu = &*self.gpu;
@@ -236,8 +238,8 @@ impl GpuRenderer {
             self.centres = Some(DeviceCentres::new(gpu, centres, field)?);
         }
         let transfer = source.as_transfer();
-        if let (None, Some(source)) = (&self.transfer, transfer) {
-            self.transfer = Some(DeviceTransfer::new(gpu, source, field)?);
+        if let (None, Some(rows)) = (&self.transfer, transfer.and(loaded.frame.rows.as_ref())) {
+            self.transfer = Some(DeviceTransfer::new(gpu, Arc::clone(rows))?);
         }
         if let (None, Some(source), Some(frame)) = (&self.light, transfer, &self.transfer) {
             self.light = Some(self.transfer_pass.light(gpu, frame, source)?);
@@ -245,14 +247,13 @@ impl GpuRenderer {
         seconds.source_radiance = start.elapsed().as_secs_f64();
         let start = Instant::now();
         let eye = self.eye.take().filter(|&eye| eye == camera.position || !source.depends_on_view());
-        let loaded = Loaded::of(&mut self.loaded, gpu, field)?;
+        let (density, volume) = loaded.density_and_volume(gpu)?;
         if let (None, Some(device), Some(centres)) = (eye, &self.centres, source.as_centres()) {
             let eye = centres.unit_from_world(camera.position);
-            self.centre_pass.shade(gpu, device, (field, &loaded.density), &loaded.volume, eye)?;
+            self.centre_pass.shade(gpu, device, (field, density), volume, eye)?;
         }
         if let (None, Some(light), Some(frame)) = (eye, &self.light, &self.transfer) {
-            let density = (field, &loaded.density);
-            self.transfer_pass.shade(gpu, frame, light, density, &loaded.volume, camera.position)?;
+            self.transfer_pass.shade(gpu, frame, light, (field, density), volume, camera.position)?;
         }
         self.eye = Some(eye.unwrap_or(camera.position));
         seconds.volume_pass = start.elapsed().as_secs_f64();

@@ -1,6 +1,6 @@
 //! The host's side of transfer: `transport/transfer/{view_directions,cells,source}.wgsl` and `product.wgsl`.
 //!
-//! Clusters and mixes of a frame go to the device once ([`DeviceTransfer`]). A change of the light uploads coefficients
+//! Clusters and mixes of a frame go to the device once ([`DeviceRows`]). A change of the light uploads coefficients
 //! and what suns let through ([`TransferPass::light`]); a change of the view ([`TransferPass::shade`], in
 //! [`super::transfer_view`]) uploads the directions in use.
 //!
@@ -11,9 +11,7 @@
 use super::device::{Gpu, GpuError};
 use super::layouts::{Product, ViewDirections as ViewsUniform};
 use super::pass::{Kernel, Step};
-use crate::medium::field::DensityField;
-use crate::shaded_volume::EMPTY;
-use crate::transport::transfer::frame::Clustered;
+use super::transfer_rows::{DeviceClusters, DeviceRows};
 use crate::transport::transfer::source::TransferSource;
 use crate::transport::transfer::view_directions::squares;
 use glam::Vec3;
@@ -46,33 +44,9 @@ pub struct TransferPass {
     pub(super) finish: Kernel,
 }
 
-/// Clustered rows on the device, and the colour channels that they are for.
-pub(super) struct DeviceClusters {
-    pub(super) channels: [f32; 4],
-    /// Means and directions of all clusters.
-    pub(super) vectors: usize,
-    pub(super) terms: usize,
-    pub(super) length: usize,
-    pub(super) bases: wgpu::Buffer,
-    /// The first row, how many, and `array<u32>`: for each its cluster, then the bits of its weights.
-    pub(super) mixes: Vec<(usize, usize, wgpu::Buffer)>,
-}
-
-/// What a frame's transfer is on the device, whatever light and view.
+/// A frame's transfer with the room that lighting it for a view takes: who draws has one of its own.
 pub struct DeviceTransfer {
-    pub(super) g: f32,
-    pub(super) bands: usize,
-    pub(super) cells: [usize; 3],
-    pub(super) side: usize,
-    /// Directions of the mesh with their solid angles, and how many.
-    pub(super) mesh: (wgpu::Buffer, usize),
-    pub(super) direct: Vec<DeviceClusters>,
-    pub(super) indirect: Vec<DeviceClusters>,
-    /// The row of each node of the field.
-    pub(super) lit_rows: wgpu::Buffer,
-    /// The place of each cell among those with density, and which cell each place is.
-    pub(super) cell_places: wgpu::Buffer,
-    pub(super) cell_numbers: wgpu::Buffer,
+    pub(super) rows: Arc<DeviceRows>,
     /// What cells send towards the eye.
     pub(super) sent: wgpu::Buffer,
     /// Views at a time; the light of each direction of the mesh in them, and the clusters lit by it, set by set.
@@ -117,41 +91,22 @@ pub(super) fn dispatch(gpu: &Gpu, stage: &'static str, work: &[Work]) -> Result<
 }
 
 impl DeviceTransfer {
-    /// A copy of the transfer of `source`, whatever light it has, for the field that it was made for.
-    pub fn new(gpu: &Gpu, source: &TransferSource, field: &DensityField) -> Result<Self, GpuError> {
-        let (transfer, cells) = (&source.transfer, &source.cells);
-        let mut lit_rows = vec![EMPTY; field.values.len()];
-        source.nodes.iter().zip(0..).for_each(|(&node, row)| lit_rows[node as usize] = row);
-        let mesh = transfer.basis.mesh().directions().iter().zip(transfer.basis.areas());
-        let mesh: Vec<[f32; 4]> = mesh.map(|(d, &area)| d.as_vec3().extend(area as f32).to_array()).collect();
+    /// Room to light `rows` in.
+    pub fn new(gpu: &Gpu, rows: Arc<DeviceRows>) -> Result<Self, GpuError> {
         let limit = (gpu.summary().storage_binding.min(gpu.summary().buffer)) as usize;
+        let directions = rows.mesh.1;
+        let widest = rows.direct.iter().map(|set| set.vectors).chain([directions]).max().unwrap_or(1);
+        // All corners of the cube are the most that can be in use.
+        let corners = 6 * (squares(rows.g) + 1).pow(2);
+        let views = (limit / (16 * widest)).clamp(1, VIEWS).min(corners);
+        let lit = |set: &DeviceClusters| gpu.storage("lit clusters", (16 * views * set.vectors) as u64);
         gpu.checked("transfer", || {
-            let sets = |sets: &[Clustered], of_channel: [usize; 3]| {
-                let used = sets.iter().enumerate().filter(|(s, set)| set.length > 0 && of_channel.contains(s));
-                used.map(|(s, set)| DeviceClusters::new(gpu, set, of_channel.map(|of| of == s), limit))
-                    .collect::<Result<Vec<_>, GpuError>>()
-            };
-            let direct = sets(&transfer.direct, transfer.direct_of_channel)?;
-            let widest = direct.iter().map(|set| set.vectors).chain([mesh.len()]).max().unwrap_or(1);
-            // All corners of the cube are the most that can be in use.
-            let corners = 6 * (squares(transfer.medium.g) + 1).pow(2);
-            let views = (limit / (16 * widest)).clamp(1, VIEWS).min(corners);
-            let lit = |set: &DeviceClusters| gpu.storage("lit clusters", (16 * views * set.vectors) as u64);
             Ok(Self {
-                g: transfer.medium.g,
-                bands: transfer.bands,
-                cells: cells.majorants.bricks,
-                side: 1 << cells.shift,
-                lit: direct.iter().map(lit).collect::<Result<_, _>>()?,
-                light: gpu.storage("light of the views", (16 * views * mesh.len()) as u64)?,
-                mesh: (gpu.upload("directions of the mesh", &mesh)?, mesh.len()),
+                lit: rows.direct.iter().map(lit).collect::<Result<_, _>>()?,
+                light: gpu.storage("light of the views", (16 * views * directions) as u64)?,
+                sent: gpu.storage("radiance of the cells", 16 * rows.lit_cells as u64)?,
                 views,
-                direct,
-                indirect: sets(&transfer.indirect, transfer.indirect_of_channel)?,
-                lit_rows: gpu.upload("rows of the nodes", &lit_rows)?,
-                cell_places: gpu.upload("places of the cells", &cells.places)?,
-                cell_numbers: gpu.upload("cells with density", &cells.bricks)?,
-                sent: gpu.storage("radiance of the cells", 16 * cells.len() as u64)?,
+                rows,
             })
         })
     }
@@ -162,38 +117,13 @@ impl DeviceTransfer {
     }
 }
 
-impl DeviceClusters {
-    fn new(gpu: &Gpu, set: &Clustered, channels: [bool; 3], limit: usize) -> Result<Self, GpuError> {
-        let words = 1 + set.terms;
-        let each = (limit / (4 * words)).max(1);
-        let part = |(number, ids): (usize, &[u8])| {
-            let first = number * each;
-            let mut mixes = Vec::with_capacity(ids.len() * words);
-            for (row, &id) in (first..).zip(ids) {
-                mixes.push(u32::from(id));
-                mixes.extend(set.weights[row * set.terms..][..set.terms].iter().map(|w| w.to_bits()));
-            }
-            Ok((first, ids.len(), gpu.upload("mixes of the rows", &mixes)?))
-        };
-        let [r, g, b] = channels.map(|used| f32::from(u8::from(used)));
-        Ok(Self {
-            channels: [r, g, b, 0.0],
-            vectors: set.clusters() * words,
-            terms: set.terms,
-            length: set.length,
-            bases: gpu.upload("clusters of the transfer", &set.bases)?,
-            mixes: set.ids.chunks(each).enumerate().map(part).collect::<Result<_, GpuError>>()?,
-        })
-    }
-}
-
 impl DeviceLight {
     /// Lit clusters, set by set, first direct where they are the same from everywhere, then indirect: `[cluster][1 + terms]`
     /// vectors, or those for each coefficient. For comparisons.
     pub fn read(&self, gpu: &Gpu, frame: &DeviceTransfer) -> Result<Vec<Vec<[f32; 4]>>, GpuError> {
-        let n = frame.bands * frame.bands;
-        let even = self.even.iter().zip(&frame.direct).map(|(buffer, set)| (buffer, set.vectors));
-        let moments = self.moments.iter().zip(&frame.indirect).map(|(buffer, set)| (buffer, set.vectors * n));
+        let n = frame.rows.bands * frame.rows.bands;
+        let even = self.even.iter().zip(&frame.rows.direct).map(|(buffer, set)| (buffer, set.vectors));
+        let moments = self.moments.iter().zip(&frame.rows.indirect).map(|(buffer, set)| (buffer, set.vectors * n));
         even.chain(moments).map(|(buffer, count)| gpu.read("lit clusters", buffer, count)).collect()
     }
 }
@@ -221,7 +151,7 @@ impl TransferPass {
 
     /// The clusters under the light of `source`, of the same frame as `frame`.
     pub fn light(&self, gpu: &Gpu, frame: &DeviceTransfer, source: &TransferSource) -> Result<DeviceLight, GpuError> {
-        let (n, medium) = (frame.bands * frame.bands, &source.transfer.medium);
+        let (n, medium) = (frame.rows.bands * frame.rows.bands, &source.transfer.medium);
         let four = |v: [f32; 3]| [v[0], v[1], v[2], 0.0];
         let shines = source.irradiance.iter().any(|e| *e != [0.0; 3]);
         let scattered = |e: &[f32; 3]| four([0, 1, 2].map(|c| e[c] * medium.albedo[c]));
@@ -239,11 +169,11 @@ impl TransferPass {
             }
         }
         let room = |set: &DeviceClusters, inner: usize| gpu.storage("lit clusters", (16 * set.vectors * inner) as u64);
-        let is_even = frame.g == 0.0 && shines;
+        let is_even = frame.rows.g == 0.0 && shines;
         let light = DeviceLight {
             irradiance: if shines { Some(gpu.upload("irradiance", &irradiance)?) } else { None },
-            even: frame.direct.iter().filter(|_| is_even).map(|set| room(set, 1)).collect::<Result<_, _>>()?,
-            moments: frame.indirect.iter().map(|set| room(set, n)).collect::<Result<_, _>>()?,
+            even: frame.rows.direct.iter().filter(|_| is_even).map(|set| room(set, 1)).collect::<Result<_, _>>()?,
+            moments: frame.rows.indirect.iter().map(|set| room(set, n)).collect::<Result<_, _>>()?,
             suns,
         };
         let coefficients = gpu.upload("coefficients of the light", &coefficients)?;
@@ -252,10 +182,10 @@ impl TransferPass {
         if let (true, Some(irradiance)) = (is_even, &light.irradiance) {
             work.extend(self.scattered(gpu, frame, irradiance, &view, (0, 1)));
         }
-        for (set, lit) in frame.direct.iter().zip(&light.even) {
+        for (set, lit) in frame.rows.direct.iter().zip(&light.even) {
             work.push(self.multiplied(gpu, set, (&frame.light, 1), lit, 1));
         }
-        for (set, lit) in frame.indirect.iter().zip(&light.moments) {
+        for (set, lit) in frame.rows.indirect.iter().zip(&light.moments) {
             work.push(self.multiplied(gpu, set, (&coefficients, 1), lit, n));
         }
         dispatch(gpu, "light of the transfer", &work)?;
@@ -271,9 +201,13 @@ impl TransferPass {
         views: &'a wgpu::Buffer,
         (first, count): (usize, usize),
     ) -> [Work<'a>; 2] {
-        let (mesh, directions) = (&frame.mesh.0, frame.mesh.1);
-        let uniform =
-            ViewsUniform { g: frame.g, directions: directions as u32, first_view: first as u32, views: count as u32 };
+        let (mesh, directions) = (&frame.rows.mesh.0, frame.rows.mesh.1);
+        let uniform = ViewsUniform {
+            g: frame.rows.g,
+            directions: directions as u32,
+            first_view: first as u32,
+            views: count as u32,
+        };
         let uniform = gpu.uniform("light of the views", &uniform);
         let weigh = Work {
             kernel: &self.weigh,

@@ -30,7 +30,7 @@ impl TransferPass {
         let node_eye = field.world_from_node.inverse().transform_point3(eye);
         let four = |v: DVec3| v.as_vec3().extend(0.0).to_array();
         let [eye, column_x, column_y, column_z] = seen_from(eye, field);
-        let (dims, bricks) = (wide(field.dims), wide(volume.bricks));
+        let (dims, bricks) = (wide(field.dims), wide(volume.table.bricks));
         let cells = CellsUniform {
             eye,
             column_x,
@@ -38,9 +38,9 @@ impl TransferPass {
             column_z,
             dims,
             bricks,
-            cells: wide(frame.cells),
-            side: frame.side as u32,
-            bands: frame.bands as u32,
+            cells: wide(frame.rows.cells),
+            side: frame.rows.side as u32,
+            bands: frame.rows.bands as u32,
             ..CellsUniform::default()
         };
         let nodes = TransferUniform {
@@ -50,15 +50,15 @@ impl TransferPass {
             column_z,
             dims,
             bricks,
-            g: frame.g,
+            g: frame.rows.g,
             ..TransferUniform::default()
         };
         // Directions that the smoke is seen in; none are needed where light is the same from everywhere, or black.
-        let seen = (frame.g != 0.0 && light.irradiance.is_some()).then(|| {
+        let seen = (frame.rows.g != 0.0 && light.irradiance.is_some()).then(|| {
             let along = |[i, j, k]: [usize; 3]| linear * (DVec3::new(i as f64, j as f64, k as f64) - node_eye);
-            let boxes = volume.runs.iter().map(|&(corner, sides)| (along(corner).as_vec3(), sides));
+            let boxes = volume.table.runs.iter().map(|&(corner, sides)| (along(corner).as_vec3(), sides));
             let edges = [linear.x_axis, linear.y_axis, linear.z_axis].map(|edge| edge.as_vec3());
-            ViewDirections::of_boxes(&boxes.collect::<Vec<_>>(), edges, squares(frame.g))
+            ViewDirections::of_boxes(&boxes.collect::<Vec<_>>(), edges, squares(frame.rows.g))
         });
         let directions: Vec<[f32; 4]> =
             seen.iter().flat_map(|seen| seen.directions().iter().map(|&d| four(d))).collect();
@@ -70,7 +70,7 @@ impl TransferPass {
             for first in (0..directions.len()).step_by(frame.views) {
                 let count = frame.views.min(directions.len() - first);
                 work.extend(self.scattered(gpu, frame, irradiance, &views, (first, count)));
-                for (set, lit) in frame.direct.iter().zip(&frame.lit) {
+                for (set, lit) in frame.rows.direct.iter().zip(&frame.lit) {
                     work.push(self.multiplied(gpu, set, (&frame.light, count), lit, 1));
                 }
                 work.extend(self.direct(&target, &frame.lit, [first, count, seen.squares()]));
@@ -79,7 +79,7 @@ impl TransferPass {
         work.extend(self.direct(&target, &light.even, [0, 1, 0]));
         for (toward, power, transmittance) in &light.suns {
             let uniform = TransferUniform { toward: toward.extend(0.0).to_array(), power: *power, ..nodes };
-            let own = [(2, &frame.lit_rows), (6, transmittance)];
+            let own = [(2, &frame.rows.lit_rows), (6, transmittance)];
             work.extend(target.pages().map(|page| target.on_page(&self.add_sun, &uniform, page, &own)));
         }
         work.extend(target.pages().map(|page| target.on_page(&self.finish, &nodes, page, &[(7, density)])));
@@ -90,7 +90,7 @@ impl TransferPass {
     fn indirect<'a>(&'a self, target: &Target<'a>, light: &'a DeviceLight, uniform: &CellsUniform) -> Vec<Work<'a>> {
         let Target { gpu, frame, volume, .. } = *target;
         let mut work = Vec::new();
-        for (number, (set, moments)) in frame.indirect.iter().zip(&light.moments).enumerate() {
+        for (number, (set, moments)) in frame.rows.indirect.iter().zip(&light.moments).enumerate() {
             for (first, count, mixes) in &set.mixes {
                 let uniform = CellsUniform {
                     terms: set.terms as u32,
@@ -102,19 +102,19 @@ impl TransferPass {
                 work.push(Work {
                     kernel: &self.send,
                     uniform: gpu.uniform("radiance of the cells", &uniform),
-                    buffers: vec![(4, &frame.cell_numbers), (5, mixes), (6, moments), (7, &frame.sent)],
+                    buffers: vec![(4, &frame.rows.cell_numbers), (5, mixes), (6, moments), (7, &frame.sent)],
                     threads: *count,
                 });
             }
         }
-        let (rows, places, sent) = ((2, &frame.lit_rows), (3, &frame.cell_places), (7, &frame.sent));
+        let (rows, places, sent) = ((2, &frame.rows.lit_rows), (3, &frame.rows.cell_places), (7, &frame.sent));
         work.extend(target.pages().map(|page| {
             let (first, count) = volume.page(page);
             let uniform = CellsUniform { first_brick: first as u32, page_bricks: count as u32, ..*uniform };
             Work {
                 kernel: &self.interpolate,
                 uniform: gpu.uniform("volume pass of transfer", &uniform),
-                buffers: vec![(1, &volume.dense_bricks), rows, places, sent, (8, &volume.pages[page])],
+                buffers: vec![(1, &volume.table.dense_bricks), rows, places, sent, (8, &volume.pages[page])],
                 threads: count * BRICK_NODES,
             }
         }));
@@ -130,7 +130,7 @@ impl TransferPass {
     ) -> Vec<Work<'a>> {
         let frame = target.frame;
         let mut work = Vec::new();
-        for (set, lit) in frame.direct.iter().zip(lit) {
+        for (set, lit) in frame.rows.direct.iter().zip(lit) {
             for (first_row, rows, mixes) in &set.mixes {
                 let uniform = TransferUniform {
                     first_row: *first_row as u32,
@@ -142,7 +142,7 @@ impl TransferPass {
                     squares: squares as u32,
                     ..target.uniform
                 };
-                let own = [(2, &frame.lit_rows), (3, mixes), (4, lit), (5, target.places)];
+                let own = [(2, &frame.rows.lit_rows), (3, mixes), (4, lit), (5, target.places)];
                 work.extend(target.pages().map(|page| target.on_page(&self.add_direct, &uniform, page, &own)));
             }
         }
@@ -177,7 +177,7 @@ impl<'a> Target<'a> {
     ) -> Work<'a> {
         let (first, count) = self.volume.page(page);
         let uniform = TransferUniform { first_brick: first as u32, page_bricks: count as u32, ..*uniform };
-        let shared = [(1, &self.volume.dense_bricks), (8, &self.volume.pages[page])];
+        let shared = [(1, &self.volume.table.dense_bricks), (8, &self.volume.pages[page])];
         Work {
             kernel,
             uniform: self.gpu.uniform("volume pass of transfer", &uniform),

@@ -104,7 +104,7 @@ impl VolumePass {
             column_y,
             column_z,
             dims: wide(field.dims),
-            bricks: wide(volume.bricks),
+            bricks: wide(volume.table.bricks),
             channels: source.channels as u32,
             ..Uniform::default()
         };
@@ -132,7 +132,7 @@ impl VolumePass {
             .iter()
             .map(|(page, planes, uniform)| {
                 let own = if let Some(planes) = planes { (2, *planes) } else { (3, density) };
-                vec![(0, uniform), (1, &volume.dense_bricks), own, (4, &volume.pages[*page])]
+                vec![(0, uniform), (1, &volume.table.dense_bricks), own, (4, &volume.pages[*page])]
             })
             .collect();
         let steps: Vec<Step> = uniforms

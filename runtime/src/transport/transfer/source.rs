@@ -103,6 +103,26 @@ pub struct TransferSource {
     even: OnceLock<Vec<LitClusters>>,
 }
 
+/// The nodes and cells that the rows of `transfer` are for, in their order; checks that it is one for the density `field`.
+pub(crate) fn rows_of(field: &DensityField, transfer: &FrameTransfer) -> Result<(Vec<u32>, Cells), TransferError> {
+    let (nodes, cells) = (lit_nodes(field), Cells::new(field, transfer.shift));
+    let check = |part, sets: &[Clustered], rows: usize, length: usize| {
+        let bad = sets.iter().find(|set| {
+            let ids = set.ids.iter().all(|&id| usize::from(id) < set.clusters());
+            !(set.ids.len() == rows && set.weights.len() == rows * set.terms && ids)
+                || !(set.length == length || rows == 0)
+        });
+        bad.map_or(Ok(()), |set| {
+            let found = format!("{} rows of {} numbers", set.ids.len(), set.length);
+            Err(TransferError { part, found, expected: format!("{rows} rows of {length} numbers") })
+        })
+    };
+    let lights = transfer.indirect_basis.kind().len();
+    check("direct light", &transfer.direct, nodes.len(), transfer.basis.areas().len())?;
+    check("indirect light", &transfer.indirect, cells.len(), lights * transfer.bands * transfer.bands)?;
+    Ok((nodes, cells))
+}
+
 impl TransferTransport {
     /// Checks that the transfer is one for this density.
     pub fn new(
@@ -110,21 +130,7 @@ impl TransferTransport {
         transfer: Arc<FrameTransfer>,
         settings: TransferSettings,
     ) -> Result<Self, TransferError> {
-        let (nodes, cells) = (lit_nodes(field), Cells::new(field, transfer.shift));
-        let check = |part, sets: &[Clustered], rows: usize, length: usize| {
-            let bad = sets.iter().find(|set| {
-                let ids = set.ids.iter().all(|&id| usize::from(id) < set.clusters());
-                !(set.ids.len() == rows && set.weights.len() == rows * set.terms && ids)
-                    || !(set.length == length || rows == 0)
-            });
-            bad.map_or(Ok(()), |set| {
-                let found = format!("{} rows of {} numbers", set.ids.len(), set.length);
-                Err(TransferError { part, found, expected: format!("{rows} rows of {length} numbers") })
-            })
-        };
-        let lights = transfer.indirect_basis.kind().len();
-        check("direct light", &transfer.direct, nodes.len(), transfer.basis.areas().len())?;
-        check("indirect light", &transfer.indirect, cells.len(), lights * transfer.bands * transfer.bands)?;
+        let (nodes, cells) = rows_of(field, &transfer)?;
         let [nx, ny, nz] = field.dims;
         let before = |line: usize| nodes.partition_point(|&node| (node as usize) < line * nx) as u32;
         let lines = (0..=ny * nz).into_par_iter().map(before).collect::<Vec<_>>();
