@@ -1,5 +1,7 @@
 //! A small pack and a scene for unit tests of the subcommands around them.
 
+#[cfg(feature = "view")]
+use crate::devices::Device;
 use crate::staging::Stage;
 use smoke_formats::gaussian::Gaussian;
 use smoke_formats::pack::{
@@ -83,6 +85,15 @@ fn write_small_pack(path: &Path, frames: &[i32], step: f32, transfer: Option<&Tr
         writer.finish(&sequence, &settings, transfer)
     });
     filled.unwrap();
+}
+
+/// The processor, and a graphics device if there is one and `SMOKE_GPU` does not forbid it; with `require` there must be.
+#[cfg(feature = "view")]
+pub fn devices() -> Vec<Device> {
+    let mode = std::env::var("SMOKE_GPU").unwrap_or_else(|_| "auto".into());
+    let graphics = (mode != "off").then(|| Device::open("gpu").ok()).flatten();
+    assert!(graphics.is_some() || mode != "require", "SMOKE_GPU=require: no graphics device");
+    [Device::Cpu].into_iter().chain(graphics).collect()
 }
 
 /// A scene without lights, 8 x 6 pixels.

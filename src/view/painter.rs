@@ -136,7 +136,7 @@ impl Painter {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{small_pack, stage};
+    use crate::testing::{devices, small_pack, stage};
     use smoke_formats::pack::Pack;
     use smoke_formats::scene::{Camera as SceneCamera, Light as SceneLight, Scene, Sky};
     use smoke_runtime::medium::frame::Frame;
@@ -160,7 +160,7 @@ mod tests {
         let path = folder.path().join("a.smoke");
         small_pack(&path, &[1, 2], 0.01);
         let pack = Pack::open(&path).unwrap();
-        let frames = [0, 1].map(|i| DeviceFrame::Cpu(Arc::new(Frame::read(&pack, i).unwrap())));
+        let frames = [0, 1].map(|i| Arc::new(Frame::read(&pack, i).unwrap()));
         let mut edits: Vec<(Scene, usize)> = vec![(scene(), 0)];
         let mut edit = |frame, change: &dyn Fn(&mut Scene)| {
             let mut scene = edits.last().unwrap().0.clone();
@@ -174,15 +174,18 @@ mod tests {
         });
         edit(0, &|s| (s.medium.albedo, s.medium.g) = ([0.5; 3], 0.4));
         let method = Method::Compensated(RenderSettings::default());
-        let mut painter = Painter::new(Device::Cpu);
-        let mut before: Option<Film> = None;
-        for (scene, frame) in edits {
-            let stage = stage_of(scene);
-            let film = |p: &mut Painter| p.pass(&method, &stage, &frames[frame], &stage.camera, 0).unwrap().film;
-            let edited = film(&mut painter);
-            assert_eq!(edited, film(&mut Painter::new(Device::Cpu)));
-            assert!(before.as_ref() != Some(&edited), "each edit shows");
-            before = Some(edited);
+        for device in devices() {
+            let frames = frames.each_ref().map(|frame| device.take(frame.clone()).unwrap());
+            let mut painter = Painter::new(device.clone());
+            let mut before: Option<Film> = None;
+            for (scene, frame) in &edits {
+                let stage = stage_of(scene.clone());
+                let film = |p: &mut Painter| p.pass(&method, &stage, &frames[*frame], &stage.camera, 0).unwrap().film;
+                let edited = film(&mut painter);
+                assert_eq!(edited, film(&mut Painter::new(device.clone())));
+                assert!(before.as_ref() != Some(&edited), "each edit shows");
+                before = Some(edited);
+            }
         }
     }
 

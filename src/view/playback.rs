@@ -226,7 +226,7 @@ fn kept(dims: [u32; 3], count: usize) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::small_pack;
+    use crate::testing::{devices, small_pack};
     use std::path::Path;
     use std::time::{Duration, Instant};
 
@@ -251,14 +251,6 @@ mod tests {
             reel.keep(position, Err(String::new()), ready);
         }
         order
-    }
-
-    /// The processor, and a graphics device if there is one and `SMOKE_GPU` does not forbid it.
-    fn devices() -> Vec<Device> {
-        let mode = std::env::var("SMOKE_GPU").unwrap_or_else(|_| "auto".into());
-        let graphics = (mode != "off").then(|| Device::open("gpu").ok()).flatten();
-        assert!(graphics.is_some() || mode != "require", "SMOKE_GPU=require: no graphics device");
-        [Device::Cpu].into_iter().chain(graphics).collect()
     }
 
     fn playback(folder: &Path, frames: i32, device: Device) -> (Arc<Pack>, Playback) {
