@@ -6,12 +6,15 @@
 
 pub mod at_rest;
 pub mod clusters;
+pub mod final_gather;
 pub mod photons;
+pub mod rays;
 pub mod reduce;
 pub mod seen;
 pub mod visibility;
 
 use clusters::{Clusters, cluster};
+use final_gather::FinalGather;
 use photons::{GreyMedium, PhotonSettings, Photons};
 use reduce::{Reduced, sketch};
 use seen::{seen_of_cells, seen_of_nodes, weights};
@@ -214,7 +217,14 @@ fn indirect(
         .map(|(field, cells)| Photons::new(field, cells, basis, medium, photon_settings))
         .collect();
     let all: u64 = photons.iter().map(Photons::count).sum();
-    let parts = parts(lights, 4 * (total * n) as u64, settings.memory / 2);
+    // Without photons there is no indirect light.
+    let gathers: Vec<Option<FinalGather>> = fields
+        .iter()
+        .zip(cells)
+        .map(|(field, cells)| FinalGather::new(field, cells, basis, medium, bands).filter(|_| settings.photons > 0))
+        .collect();
+    // Moments of a light in each cell, and how much of it reaches the cell.
+    let parts = parts(lights, 4 * (total * (n + 1)) as u64, settings.memory / 2);
     let columns: Vec<Range<usize>> = parts.iter().map(|p| p.start * n..p.end * n).collect();
     let flown = std::sync::atomic::AtomicU64::new(0);
     let passes = if parts.len() > 1 { 2 } else { 1 };
@@ -227,12 +237,15 @@ fn indirect(
         }
         let start = Instant::now();
         let mut values = Vec::with_capacity(total * parts[part].len() * n);
-        for photons in &photons {
+        for (photons, gather) in photons.iter().zip(&gathers) {
             let done = |number: u64| {
                 let before = flown.fetch_add(number, std::sync::atomic::Ordering::Relaxed);
                 observe(Stage::Photons, (before + number).min(passes * all), passes * all);
             };
-            let (moments, traced) = photons.trace(parts[part].clone(), &done);
+            let (mut moments, traced) = photons.trace(parts[part].clone(), &done);
+            if let Some(gather) = gather {
+                gather.gather(&parts[part], &mut moments);
+            }
             values.extend(moments);
             truncated = truncated.max(traced.truncated);
             counted += traced.photons;

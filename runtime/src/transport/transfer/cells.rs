@@ -63,6 +63,43 @@ impl Cells {
         Self { majorants, shift, places, bricks, mass }
     }
 
+    /// The mean over each cell's density of each of some functions, trilinear as the density is, by their values at the
+    /// nodes of the field that the cells are of: `[cell][function]`.
+    ///
+    /// The integral of the product of both, which is not the sum of their products at nodes: that one takes a function
+    /// that falls where density rises for zero.
+    pub fn means(&self, field: &DensityField, functions: &[Vec<f32>]) -> Vec<f32> {
+        let side = 1usize << self.shift;
+        let [nx, ny, _] = field.dims;
+        let [bx, by, _] = self.majorants.bricks;
+        let mut out = vec![0.0; self.len() * functions.len()];
+        out.par_chunks_mut(functions.len().max(1)).zip(&self.bricks).for_each_init(
+            Vec::new,
+            |weights, (out, &brick)| {
+                let brick = brick as usize;
+                let first = [brick % bx, brick / bx % by, brick / bx / by].map(|b| b * side);
+                let count = [0, 1, 2].map(|a| (first[a] + side).min(field.dims[a] - 1) - first[a] + 1);
+                let place = |at: usize| {
+                    let [i, j, k] = [at % count[0], at / count[0] % count[1], at / count[0] / count[1]];
+                    first[0] + i + nx * (first[1] + j + ny * (first[2] + k))
+                };
+                weights.clear();
+                weights.extend((0..count.iter().product()).map(|at| f64::from(field.values[place(at)])));
+                for (n, stride) in [(count[0], 1), (count[1], count[0]), (count[2], count[0] * count[1])] {
+                    weigh(weights, n, stride);
+                }
+                let mass: f64 = weights.iter().sum();
+                // A cell has density; where it is too small to be summed, nothing is.
+                let scale = if mass > 0.0 { 1.0 / mass } else { 0.0 };
+                for (out, function) in out.iter_mut().zip(functions) {
+                    let each = weights.iter().enumerate().map(|(at, weight)| weight * f64::from(function[place(at)]));
+                    *out = (scale * each.sum::<f64>()) as f32;
+                }
+            },
+        );
+        out
+    }
+
     /// The number of cells with density.
     pub fn len(&self) -> usize {
         self.mass.len()
@@ -114,6 +151,22 @@ impl Cells {
     }
 }
 
+/// Values at the `n` nodes of lines that are `stride` apart to the integrals of their piecewise linear function with the
+/// hat function of each node.
+fn weigh(values: &mut [f64], n: usize, stride: usize) {
+    for start in (0..values.len()).filter(|at| (at / stride).is_multiple_of(n)) {
+        let mut before = 0.0;
+        for node in 0..n {
+            let at = start + node * stride;
+            let here = values[at];
+            let after = if node + 1 < n { values[at + stride] } else { 0.0 };
+            let sides = f64::from(u8::from(node > 0) + u8::from(node + 1 < n));
+            values[at] = (before + after) / 6.0 + sides * here / 3.0;
+            before = here;
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -133,6 +186,31 @@ mod tests {
         }
         let empty = DensityField::from_box([0; 3], [3; 3], &[0.0; 27], DAffine3::IDENTITY);
         assert!(Cells::new(&empty, 1).is_empty());
+    }
+
+    #[test]
+    fn means_over_the_density_are_those_of_the_trilinear_product() {
+        // D = x + 2 y, f = 3 - x + z (and 1) in cells of two voxels: both trilinear, so that the integrals are polynomials.
+        let dims = [5, 5, 7];
+        let at = |v: usize| [v % 5, v / 5 % 5, v / 25].map(|n| n as f64);
+        let of = |f: &dyn Fn([f64; 3]) -> f64| (0..175).map(|v| f(at(v)) as f32).collect::<Vec<f32>>();
+        let values = of(&|[x, y, _]| x + 2.0 * y);
+        let field = DensityField { dims, values, world_from_node: DAffine3::from_scale(DVec3::splat(0.1)) };
+        let cells = Cells::new(&field, 1);
+        let means = cells.means(&field, &[of(&|[x, _, z]| 3.0 - x + z), vec![1.0; 175]]);
+        assert_eq!(means.len(), 2 * cells.len());
+        for (mean, &brick) in means.chunks(2).zip(&cells.bricks) {
+            let brick = brick as usize;
+            let [a, b, c] = [brick % 2, brick / 2 % 2, brick / 4].map(|n| 2.0 * n as f64);
+            // Over [a, a + 2] and so on: means of x, x^2, y, z.
+            let (x, xx, y, z) = (a + 1.0, a * a + 2.0 * a + 4.0 / 3.0, b + 1.0, c + 1.0);
+            let expected = (x + 2.0 * y) * (3.0 + z) - (xx + 2.0 * y * x);
+            let expected = expected / (x + 2.0 * y);
+            assert!(
+                (f64::from(mean[0]) - expected).abs() < 1e-5 && (mean[1] - 1.0).abs() < 1e-6,
+                "{mean:?} {expected}"
+            );
+        }
     }
 
     #[test]
