@@ -242,6 +242,7 @@ fn watch(
         let stage = match stage {
             TransferStage::Direct => "direct light",
             TransferStage::Photons => "photons",
+            TransferStage::Gather => "gathering",
             TransferStage::Compress => "compressing",
         };
         progress.describe(format!("frame {frame}, transfer, {stage} {:.0} %", 100.0 * part));

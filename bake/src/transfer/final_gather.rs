@@ -133,17 +133,23 @@ impl<'a> FinalGather<'a> {
         }
     }
 
-    /// Replaces the photons' moments of the lights `wanted`, `[cell][light - wanted.start][l (l + 1) + m]`, by gathered ones.
-    pub fn gather(&self, wanted: &Range<usize>, moments: &mut [f32]) {
+    /// Replaces the photons' moments of the lights `wanted`, `[cell][light - wanted.start][l (l + 1) + m]`, by gathered ones;
+    /// `done` is told numbers of lights as they are finished.
+    pub fn gather(&self, wanted: &Range<usize>, moments: &mut [f32], done: &(dyn Fn(u64) + Sync)) {
         let n = self.bands * self.bands;
         let first = self.first_scattering(wanted);
         let blocks: Vec<Range<usize>> =
             (0..wanted.len()).step_by(LANES).map(|k| k..wanted.len().min(k + LANES)).collect();
-        // As many blocks as there are threads are there at a time; none reads what another one writes.
-        for blocks in blocks.chunks(rayon::current_num_threads()) {
+        // Blocks of a quarter of the lights at a time take half the bytes of the moments; none reads what another one writes.
+        let at_once = (wanted.len() / (4 * LANES)).max(1);
+        for blocks in blocks.chunks(at_once) {
             let photons = &*moments;
-            let gathered: Vec<Vec<Lanes>> =
-                blocks.par_iter().map(|lights| self.gather_block(lights, &first, photons)).collect();
+            let gather = |lights: &Range<usize>| {
+                let gathered = self.gather_block(lights, &first, photons);
+                done(lights.len() as u64);
+                gathered
+            };
+            let gathered: Vec<Vec<Lanes>> = blocks.par_iter().map(gather).collect();
             moments.par_chunks_exact_mut(wanted.len() * n).enumerate().for_each(|(cell, row)| {
                 for (lights, gathered) in blocks.iter().zip(&gathered) {
                     for (lane, k) in lights.clone().enumerate() {
@@ -348,7 +354,7 @@ mod tests {
                     }
                 }
             }
-            gather.gather(&(0..lights), &mut moments);
+            gather.gather(&(0..lights), &mut moments, &|_| ());
             for cell in 0..cells.len() {
                 let sum: f64 = (0..lights).map(|k| f64::from(moments[(cell * lights + k) * n])).sum();
                 let whole = sum / Y + straight(cell);
@@ -373,7 +379,11 @@ mod tests {
             let truth = photons(&field, &cells, &basis, medium, 400);
             let few = photons(&field, &cells, &basis, medium, 4);
             let mut gathered = few.clone();
-            FinalGather::new(&field, &cells, &basis, medium, bands(medium)).unwrap().gather(&(0..42), &mut gathered);
+            FinalGather::new(&field, &cells, &basis, medium, bands(medium)).unwrap().gather(
+                &(0..42),
+                &mut gathered,
+                &|_| (),
+            );
             let error = |found: &[f32]| {
                 let square = |a: f32, b: f32| f64::from(a - b).powi(2);
                 let errors: f64 = found.iter().zip(&truth).map(|(a, b)| square(*a, *b)).sum();
@@ -397,7 +407,7 @@ mod tests {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
             pool.install(|| {
                 let mut moments = noisy.clone();
-                FinalGather::new(&field, &cells, &basis, medium, 4).unwrap().gather(&(0..42), &mut moments);
+                FinalGather::new(&field, &cells, &basis, medium, 4).unwrap().gather(&(0..42), &mut moments, &|_| ());
                 moments
             })
         };
@@ -407,7 +417,7 @@ mod tests {
         for part in [0..5, 5..42] {
             let rows = noisy.chunks(42 * 16).flat_map(|row| &row[16 * part.start..16 * part.end]);
             let mut moments: Vec<f32> = rows.copied().collect();
-            gather.gather(&part, &mut moments);
+            gather.gather(&part, &mut moments, &|_| ());
             for (row, whole) in moments.chunks(16 * part.len()).zip(whole.chunks(42 * 16)) {
                 assert_eq!(row, &whole[16 * part.start..16 * part.end]);
             }
@@ -422,7 +432,7 @@ mod tests {
             let cells = Cells::new(&field, 1);
             let medium = GreyMedium { sigma_t, albedo: 1.0, g: 0.0 };
             let mut moments = vec![0.01; cells.len() * 42];
-            FinalGather::new(&field, &cells, &basis, medium, 1).unwrap().gather(&(0..42), &mut moments);
+            FinalGather::new(&field, &cells, &basis, medium, 1).unwrap().gather(&(0..42), &mut moments, &|_| ());
             assert!(moments.iter().all(|v| v.is_finite() && (0.0..=1.0).contains(v)), "{scale} {sigma_t}");
         }
         let one = DensityField::from_box([0; 3], [1; 3], &[2.0], DAffine3::IDENTITY);

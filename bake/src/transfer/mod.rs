@@ -1,8 +1,8 @@
 //! Precomputed volume radiance transfer (Zhang, Dong and Ma 2013): what the smoke sends out under each light of a basis.
 //!
-//! A run of frames, in order: [`mod@visibility`] (how much of each direction reaches each voxel) and [`photons`] (what is
-//! scattered more often), each [`reduce`]d to short rows and [`clusters`] of them. Frames of a run share their clusters.
-//! What this gives is what the pack holds and the runtime lights: [`smoke_runtime::transport::transfer`].
+//! A run of frames, in order: [`mod@visibility`] (how much of each direction reaches each voxel); [`photons`] (what is
+//! scattered more often) and their [`final_gather`], on [`rays`]; each [`reduce`]d to short rows and [`clusters`] of them.
+//! Frames of a run share their clusters. What this gives is what the pack holds and the runtime lights: [`smoke_runtime::transport::transfer`].
 
 pub mod at_rest;
 pub mod clusters;
@@ -93,6 +93,8 @@ pub enum Stage {
     Direct,
     /// Photons done, of so many.
     Photons,
+    /// Lights gathered, of so many.
+    Gather,
     /// Rows to clusters.
     Compress,
 }
@@ -102,7 +104,7 @@ pub enum Stage {
 pub struct TransferSeconds {
     /// Sweeps.
     pub direct: f64,
-    /// Photons, those of a second pass where memory is short included.
+    /// Photons and their final gather, those of a second pass where memory is short included.
     pub photons: f64,
     /// Reducing and clustering.
     pub compress: f64,
@@ -217,6 +219,7 @@ fn indirect(
         .map(|(field, cells)| Photons::new(field, cells, basis, medium, photon_settings))
         .collect();
     let all: u64 = photons.iter().map(Photons::count).sum();
+    let start = Instant::now();
     // Without photons there is no indirect light.
     let gathers: Vec<Option<FinalGather>> = fields
         .iter()
@@ -226,11 +229,10 @@ fn indirect(
     // Moments of a light in each cell, and how much of it reaches the cell.
     let parts = parts(lights, 4 * (total * (n + 1)) as u64, settings.memory / 2);
     let columns: Vec<Range<usize>> = parts.iter().map(|p| p.start * n..p.end * n).collect();
-    let flown = std::sync::atomic::AtomicU64::new(0);
+    let (flown, gathered) = (std::sync::atomic::AtomicU64::new(0), std::sync::atomic::AtomicU64::new(0));
     let passes = if parts.len() > 1 { 2 } else { 1 };
     let mut kept: Option<Arc<Vec<f32>>> = None;
-    let (mut seconds, mut truncated, mut counted) = (0.0, 0.0f64, 0);
-    let start = Instant::now();
+    let (mut seconds, mut truncated, mut counted) = (start.elapsed().as_secs_f64(), 0.0f64, 0);
     let trace = |part: usize| -> Arc<Vec<f32>> {
         if let Some(values) = &kept {
             return values.clone();
@@ -244,7 +246,11 @@ fn indirect(
             };
             let (mut moments, traced) = photons.trace(parts[part].clone(), &done);
             if let Some(gather) = gather {
-                gather.gather(&parts[part], &mut moments);
+                let gather_all = passes * (lights * fields.len()) as u64;
+                gather.gather(&parts[part], &mut moments, &|number| {
+                    let before = gathered.fetch_add(number, std::sync::atomic::Ordering::Relaxed);
+                    observe(Stage::Gather, (before + number).min(gather_all), gather_all);
+                });
             }
             values.extend(moments);
             truncated = truncated.max(traced.truncated);
