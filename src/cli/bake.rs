@@ -178,7 +178,7 @@ pub struct BakeArgs {
     /// Frames per second of the sequence, kept in the pack [default: not stated].
     #[arg(long, value_name = "FPS", value_parser = positive)]
     pub fps: Option<f64>,
-    /// Seed of the search for perfect hashes, the only random choice.
+    /// Seed of the search for perfect hashes and of the transfer's photons, the only random choices.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
     /// Threads; the result does not depend on it [default: one for each core].

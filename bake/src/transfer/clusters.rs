@@ -2,11 +2,12 @@
 //! its directions.
 //!
 //! Rows are first clustered by distance (k-means, started by k-means++ with a seed); then, over and over, each cluster
-//! gets its mean and the `terms` directions that hold most of its rows, and each row moves to the cluster that leaves the
-//! least of it, `|x - mean|^2 - |V (x - mean)|^2`. The error falls in every round. A cluster that lost all its rows
-//! starts again from the row that is worst off. Rows are short ones, see [`super::reduce`].
-//! With one cluster this is plain principal components, and with no terms plain k-means.
-//! Cost: rows x clusters x (1 + terms) x length a round; rounds see at most [`TRAINING`] rows, and the last all of them.
+//! gets its mean and the `terms` directions that hold most of its rows, and each row moves to the cluster that leaves
+//! the least of it, `|x - mean|^2 - |V (x - mean)|^2`. The error falls in every round. A cluster that lost all its rows
+//! starts again from the row that is worst off. Rows are short ones, see [`super::reduce`]. With one cluster this is
+//! plain principal components, and with no terms plain k-means.
+//! Cost: rows x clusters x (1 + terms) x length a round; rounds see at most [`TRAINING`] rows, and the last all of
+//! them.
 
 use super::reduce::eigenvectors;
 use rayon::prelude::*;
@@ -55,8 +56,8 @@ impl Clusters {
     }
 }
 
-/// Clusters `rows` (`[n][length]`) into at most `clusters` (1 to 256) of `terms` directions, so that the least is left of
-/// rows times their `weights`, >= 0.
+/// Clusters `rows` (`[n][length]`) into at most `clusters` (1 to 256) of `terms` directions, so that the least is left
+/// of rows times their `weights`, >= 0.
 pub fn cluster(rows: &[f32], length: usize, weights: &[f32], clusters: usize, terms: usize, seed: u64) -> Clusters {
     let n = rows.len().checked_div(length).unwrap_or(0);
     if n == 0 {
@@ -79,8 +80,8 @@ pub fn cluster(rows: &[f32], length: usize, weights: &[f32], clusters: usize, te
     Clusters { terms, bases: bases.values, ids, weights }
 }
 
-/// k-means++ (Arthur and Vassilvitskii 2007): each seed is a row drawn by its squared and weighted distance from the seeds
-/// before.
+/// k-means++ (Arthur and Vassilvitskii 2007): each seed is a row drawn by its squared and weighted distance from the
+/// seeds before.
 fn seeds(rows: &[f32], length: usize, weights: &[f32], count: usize, seed: u64) -> Vec<f32> {
     let n = rows.len() / length;
     let mut random = Random::new(mix(seed));
@@ -109,8 +110,8 @@ fn seeds(rows: &[f32], length: usize, weights: &[f32], count: usize, seed: u64) 
     out
 }
 
-/// The `terms` directions that hold most of `rows` (`[n][length]`), `[term][length]`; zeros where there are fewer. From the
-/// smaller of the two matrices: rows by rows has the same eigenvalues, and `V = X^T U / sqrt(lambda)`.
+/// The `terms` directions that hold most of `rows` (`[n][length]`), `[term][length]`; zeros where there are fewer. From
+/// the smaller of the two matrices: rows by rows has the same eigenvalues, and `V = X^T U / sqrt(lambda)`.
 fn principal(rows: &[f32], length: usize, terms: usize) -> Vec<f32> {
     let n = rows.len() / length;
     let side = n.min(length);
@@ -302,7 +303,8 @@ mod tests {
 
     #[test]
     fn few_rows_have_the_directions_that_their_columns_have() {
-        // Seven rows of twelve numbers, of rank 6 about their mean; ten zeros more make the other matrix the smaller one.
+        // Seven rows of twelve numbers, of rank 6 about their mean; ten zeros more make the other matrix the smaller
+        // one.
         let mut random = Random::new(5);
         let rows: Vec<f32> = (0..7 * 12).map(|_| random.unit() - 0.5).collect();
         let more = [&rows[..], &[0.0; 10 * 12]].concat();

@@ -1,20 +1,20 @@
-//! The last flight of indirect light, without chance.
+//! The last flights of indirect light, without chance.
 //!
-//! With I the incident radiance of light that was scattered before, T the transmittance from a light and p the phase function,
-//! `J = albedo int p (I + T L)` is what a place sends on and `I(x, w) = int exp(-tau) sigma_t D J(x + s w, w) ds`. Photons
-//! ([`super::photons`]) give the I on the right, unbiased and noisy; on the left each cell gets the light of all cells along the
-//! rays that meet there, and the noise of hundreds of them is averaged. That is the final gathering of photon maps (Jensen 1996,
-//! section 5). Zhang et al. 2013 keep what the photons left.
+//! With I the incident radiance of light that was scattered before, T the transmittance from a light and p the phase
+//! function, `J = albedo int p (I + T L)` is what a place sends on and `I(x, w) = int exp(-tau) sigma_t D J(x + s w, w)
+//! ds`. Photons ([`super::photons`]) give the I on the right, unbiased and noisy; on the left each cell gets the light
+//! of all cells along the rays that meet there, and the noise of hundreds of them is averaged. That is the final
+//! gathering of photon maps (Jensen 1996, section 5). Zhang et al. 2013 keep what the photons left.
 //!
-//! *Rays* ([`super::rays`]) go along fixed directions through a grid of a node a cell. What a cell has received of them is scaled to
-//! the opacity of its voxels, `1 - T` by a sweep of the whole field. So a constant J sends what it would through the voxels, in
-//! every direction, and white smoke stays white, however coarse the cells.
-//! *First scattering* has the phase function up to the degree that the directions integrate exactly; what is scattered more often
-//! has the photons' bands.
-//! Gathered light has another error in place of noise, that of cells: one gathering is the best number of them (two, with 10
-//! photons a face, gave 1.69 % in place of 1.64 for a sun at g = 0.5, and 0.82 in place of 0.75 for a sky at g = 0).
-//! Cost: a sweep of the field for each direction of a mesh twice as fine as that of the lights, and for each cell, ordinate
-//! and light about `3 bands^2 + 30` operations.
+//! *Rays* ([`super::rays`]) go along fixed directions through a grid of a node a cell. What a cell has received of them
+//! is scaled to the opacity of its voxels, `1 - T` by a sweep of the whole field. So a constant J sends what it would
+//! through the voxels, in every direction, and white smoke stays white, however coarse the cells.
+//! *First scattering* has the phase function up to the degree that the directions integrate exactly; what is scattered
+//! more often has the photons' bands.
+//! *Twice, by halves.* Gathered light has the error of cells in place of noise, so a second gathering takes the rest of
+//! the noise and adds of that error: what is gathered last is sent on half by the photons, half by a first gathering.
+//! Cost: a sweep of the field for each direction of a mesh twice as fine as that of the lights, and for each cell,
+//! ordinate, light and gathering about `3 bands^2 + 30` operations.
 
 use super::photons::GreyMedium;
 use super::rays::{LANES, Lanes, Placed, Rays, of_slices};
@@ -34,8 +34,10 @@ use std::ops::Range;
 /// Mean cosine up to which light is gathered: beyond, the bands of what is scattered again hold too little of the phase
 /// function.
 const LARGEST_G: f32 = 0.75;
-/// Rings of the directions, which have twice as many each; with 8 the errors above are the same.
+/// Rings of the directions, which have twice as many each; with 8 an image has the same error.
 const RINGS: usize = 6;
+/// How much of what is sent on to be gathered last is the photons'; the rest was gathered from them before.
+const PHOTONS_SHARE: f32 = 0.5;
 /// Bytes of transmittances that are held at a time.
 const HELD_BYTES: usize = 256 << 20;
 
@@ -79,8 +81,8 @@ struct Block {
 }
 
 impl<'a> FinalGather<'a> {
-    /// For moments of `bands` bands; none where the photons' own are better: at large `|g|`, for bases whose lights come from
-    /// everywhere, and in smoke that scatters nothing.
+    /// For moments of `bands` bands; none where the photons' own are better: at large `|g|`, for bases whose lights
+    /// come from everywhere, and in smoke that scatters nothing.
     pub fn new(
         field: &'a DensityField,
         cells: &'a Cells,
@@ -123,8 +125,8 @@ impl<'a> FinalGather<'a> {
         out
     }
 
-    /// Calls `visit(first, count, means)` with the transmittance from `count` directions from `first` on to each cell, some at
-    /// a time: `[cell][count]`.
+    /// Calls `visit(first, count, means)` with the transmittance from `count` directions from `first` on to each cell,
+    /// some at a time: `[cell][count]`.
     fn transmittances(&self, toward: &[Vec3], mut visit: impl FnMut(usize, usize, &[f32])) {
         let held = (HELD_BYTES / (4 * self.field.values.len())).max(8);
         for (directions, first) in toward.chunks(held).zip((0..).step_by(held)) {
@@ -133,14 +135,15 @@ impl<'a> FinalGather<'a> {
         }
     }
 
-    /// Replaces the photons' moments of the lights `wanted`, `[cell][light - wanted.start][l (l + 1) + m]`, by gathered ones;
-    /// `done` is told numbers of lights as they are finished.
+    /// Replaces the photons' moments of the lights `wanted`, `[cell][light - wanted.start][l (l + 1) + m]`, by gathered
+    /// ones; `done` is told numbers of lights as they are finished.
     pub fn gather(&self, wanted: &Range<usize>, moments: &mut [f32], done: &(dyn Fn(u64) + Sync)) {
         let n = self.bands * self.bands;
         let first = self.first_scattering(wanted);
         let blocks: Vec<Range<usize>> =
             (0..wanted.len()).step_by(LANES).map(|k| k..wanted.len().min(k + LANES)).collect();
-        // Blocks of a quarter of the lights at a time take half the bytes of the moments; none reads what another one writes.
+        // Blocks of a quarter of the lights at a time take half the bytes of the moments; none reads what another one
+        // writes.
         let at_once = (wanted.len() / (4 * LANES)).max(1);
         for blocks in blocks.chunks(at_once) {
             let photons = &*moments;
@@ -171,17 +174,24 @@ impl<'a> FinalGather<'a> {
             again: vec![none; cells * n],
             gathered: vec![none; cells * n],
         };
-        let gains: Vec<f32> = (0..n).map(|lm| self.medium.albedo * self.medium.g.powi(BAND[lm] as i32)).collect();
         for (lane, k) in lights.clone().enumerate() {
             block.reaches.iter_mut().zip(&first[k].reaches).for_each(|(out, v)| out[lane] = *v);
             block.phase.iter_mut().zip(&first[k].phase).for_each(|(out, v)| out[lane] = *v);
-            for (cell, row) in photons.chunks_exact(first.len() * n).enumerate() {
-                let moments = row[k * n..][..n].iter().zip(&gains);
-                block.again[cell * n..][..n].iter_mut().zip(moments).for_each(|(out, (v, gain))| out[lane] = gain * v);
-            }
         }
-        for group in 0..6 {
-            self.sweep(group, &mut block);
+        let gains: Vec<f32> = (0..n).map(|lm| self.medium.albedo * self.medium.g.powi(BAND[lm] as i32)).collect();
+        // The first time what the photons left is sent on, then the mean of that and of what was gathered.
+        for share in [1.0, PHOTONS_SHARE] {
+            for (cell, row) in photons.chunks_exact(first.len() * n).enumerate() {
+                let cell = cell * n..(cell + 1) * n;
+                let (again, gathered) = (&mut block.again[cell.clone()], &mut block.gathered[cell]);
+                for (lm, (again, gathered)) in again.iter_mut().zip(gathered).enumerate() {
+                    for (lane, k) in lights.clone().enumerate() {
+                        again[lane] = gains[lm] * (share * row[k * n + lm] + (1.0 - share) * gathered[lane]);
+                    }
+                    *gathered = none;
+                }
+            }
+            (0..6).for_each(|group| self.sweep(group, &mut block));
         }
         block.gathered
     }
@@ -274,7 +284,8 @@ impl<'a> FinalGather<'a> {
         first
     }
 
-    /// Albedo times the phase function at a cosine of look directions, up to the degree that the ordinates integrate exactly.
+    /// Albedo times the phase function at a cosine of look directions, up to the degree that the ordinates integrate
+    /// exactly.
     fn scattered(&self, cosine: f64) -> f64 {
         let g = f64::from(self.medium.g);
         let (mut sum, mut power, mut before, mut legendre) = (0.0, 1.0, 0.0, 1.0);

@@ -1,8 +1,10 @@
-//! Precomputed volume radiance transfer (Zhang, Dong and Ma 2013): what the smoke sends out under each light of a basis.
+//! Precomputed volume radiance transfer (Zhang, Dong and Ma 2013): what the smoke sends out under each light of a
+//! basis.
 //!
 //! A run of frames, in order: [`mod@visibility`] (how much of each direction reaches each voxel); [`photons`] (what is
-//! scattered more often) and their [`final_gather`], on [`rays`]; each [`reduce`]d to short rows and [`clusters`] of them.
-//! Frames of a run share their clusters. What this gives is what the pack holds and the runtime lights: [`smoke_runtime::transport::transfer`].
+//! scattered more often) and their [`final_gather`], on [`rays`]; each [`reduce`]d to short rows and [`clusters`] of
+//! them. Frames of a run share their clusters. What this gives is what the pack holds and the runtime lights:
+//! [`smoke_runtime::transport::transfer`].
 
 pub mod at_rest;
 pub mod clusters;
@@ -53,8 +55,8 @@ pub struct TransferSettings {
 
 /// Bands of indirect light where the phase function has more than one: the next is below 7 % of it at g = 0.5.
 const BANDS: usize = 4;
-/// Numbers of a short row, at least, direct and indirect; more if there are more terms. With 128 in place of 256 the sun at
-/// g = 0.5 would be off by 3.0 % in place of 2.3 (128 x 4): lobes of suns are what is cut off first.
+/// Numbers of a short row, at least, direct and indirect; more if there are more terms. With 128 in place of 256 the
+/// sun at g = 0.5 would be off by 3.0 % in place of 2.3 (128 x 4): lobes of suns are what is cut off first.
 const RANKS: [usize; 2] = [96, 256];
 
 impl TransferSettings {

@@ -2,20 +2,21 @@
 //!
 //! *Emission.* Directions are stratified over the triangles of the light's mesh and evenly spread in each; places lie
 //! evenly in the box's shadow, so that a photon of direction l carries `A_p(l) Omega / N` for radiance 1, A_p the box's
-//! area seen from l: no noise of a cosine (Zhang et al. 2013, section 6.1, draws directions from the whole sphere at each
-//! face, 600 times the variance at 642 basis lights). A photon counts for every basis light with `w_k(l) > 0`: one set
-//! of paths serves all, with the expectation of a set for each. Weights are signed for harmonics; nothing is clipped.
+//! area seen from l: no noise of a cosine (Zhang et al. 2013, section 6.1, draws directions from the whole sphere at
+//! each face, 600 times the variance at 642 basis lights). A photon counts for every basis light with `w_k(l) > 0`: one
+//! set of paths serves all, with the expectation of a set for each. Weights are signed for harmonics; nothing is
+//! clipped.
 //!
 //! *Flight.* The first collision is placed by the exact depth of the column, so photons that would cross thin smoke are
-//! not lost; later ones by null collisions (Woodcock et al. 1965), cell by cell, and by the exact depth where those do not
-//! end: in a cell of depth 1e5 whose density falls to nothing there would be thousands. The paper draws a new number in every
-//! step while it keeps adding up the depth, which gives a free path that shrinks with the step.
+//! not lost; later ones by null collisions (Woodcock et al. 1965), cell by cell, and by the exact depth where those do
+//! not end: in a cell of depth 1e5 whose density falls to nothing there would be thousands. The paper draws a new
+//! number in every step while it keeps adding up the depth, which gives a free path that shrinks with the step.
 //!
 //! *Deposit.* Along every flight after the first collision: `Phi D ds y_lm(-w)`, D at a random point of the flight's
-//! piece in each cell, over the cell's mass. That is the mean of the incident radiance's moments over the cell's density
-//! (track-length estimator; Spanier and Gelbard 1969), without a kernel to be normalised at borders: constant light
-//! and albedo 1 give 4 pi everywhere. The paper deposits absorbed photons only, which gives nothing at albedo 1, and
-//! counts light that was not scattered twice. The phase function is applied once a cell: band l times `albedo g^l`.
+//! piece in each cell, over the cell's mass. That is the mean of the incident radiance's moments over the cell's
+//! density (track-length estimator; Spanier and Gelbard 1969), without a kernel to be normalised at borders: constant
+//! light and albedo 1 give 4 pi everywhere. The paper deposits absorbed photons only, which gives nothing at albedo 1,
+//! and counts light that was not scattered twice. The phase function is applied once a cell: band l times `albedo g^l`.
 //! Cost: about 10 look-ups of density a flight, and for each cell on it one addition of 3 to 6 rows of moments.
 
 use glam::{DVec3, Vec3};
@@ -307,8 +308,8 @@ impl<'a> Photons<'a> {
         }
     }
 
-    /// A path of a `weight` from its first collision on, where it comes along `way`; `after` decides where it goes on, and
-    /// `fly(ray, way, weight, random)` flies to the next collision.
+    /// A path of a `weight` from its first collision on, where it comes along `way`; `after` decides where it goes on,
+    /// and `fly(ray, way, weight, random)` flies to the next collision.
     #[expect(clippy::too_many_arguments, reason = "a path's state, and what it is followed with")]
     #[inline(always)]
     fn follow(
@@ -344,8 +345,8 @@ impl<'a> Photons<'a> {
         }
     }
 
-    /// A flight to the next collision, or out; each cell on the way gets the row `flight` times the power, the length in
-    /// the cell, and the density at a random point of it.
+    /// A flight to the next collision, or out; each cell on the way gets the row `flight` times the power, the length
+    /// in the cell, and the density at a random point of it.
     #[inline(always)]
     fn fly(&self, ray: &Ray, power: f32, flight: &[f32], sums: &mut [f32], random: &mut Random) -> Option<f64> {
         let majorants = &self.cells.majorants;

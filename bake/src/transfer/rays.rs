@@ -1,8 +1,8 @@
 //! What many lights send along one direction through the cells, ray by ray, slice by slice.
 //!
-//! `L <- L e^-x + J (1 - e^-x)`, x the optical depth between two slices and J the mean of a source that is linear in optical
-//! depth. The rays are sheared columns ([`columns`]): a ray is never interpolated on its way, only what a
-//! slice sends where the ray meets it, and what has arrived where a cell lies between rays. A slice's source is weighted by
+//! `L <- L e^-x + J (1 - e^-x)`, x the optical depth between two slices and J the mean of a source that is linear in
+//! optical depth. The rays are sheared columns ([`columns`]): a ray is never interpolated on its way, only what a slice
+//! sends where the ray meets it, and what has arrived where a cell lies between rays. A slice's source is weighted by
 //! density, so what lies beside smoke is not mixed in. Lights go together, as all of them have the same depths.
 //! Cost: one exponential a ray and slice, and for each light 16 operations.
 //!
@@ -21,7 +21,8 @@ pub type Lanes = [f32; LANES];
 /// A cell of a slice: its place there, `row * columns + column`, and which cell it is.
 pub type Placed = (u32, u32);
 
-/// The cells of each slice across an axis, of a grid that has a node for each cell of the box and a border of one around.
+/// The cells of each slice across an axis, of a grid that has a node for each cell of the box and a border of one
+/// around.
 pub fn of_slices(cells: &Cells, dims: [usize; 3], axis: usize) -> Vec<Vec<Placed>> {
     let [bx, by, _] = cells.majorants.bricks;
     let mut out = vec![Vec::new(); dims[axis]];
@@ -53,9 +54,9 @@ impl Rays {
         Self { density: vec![0.0; count], source: lanes.clone(), radiance: lanes, opacity: vec![0.0; count] }
     }
 
-    /// Carries the rays to slice number `step` of their way. `emit(cell)` is the source radiance of a cell of that slice along
-    /// them; `receive(cell, radiance, opacity)` is told what has arrived there, and what a source of 1 would have sent. `emitted`
-    /// is scratch, one a node of a slice.
+    /// Carries the rays to slice number `step` of their way. `emit(cell)` is the source radiance of a cell of that
+    /// slice along them; `receive(cell, radiance, opacity)` is told what has arrived there, and what a source of 1
+    /// would have sent. `emitted` is scratch, one a node of a slice.
     #[expect(clippy::too_many_arguments, reason = "the inner loop of a sweep")]
     pub fn advance(
         &mut self,
@@ -159,8 +160,8 @@ mod tests {
     use glam::{DAffine3, Vec3};
     use smoke_runtime::medium::field::DensityField;
 
-    /// Every direction, through a box of constant density: a constant source sends the opacity of the way, and a source that is
-    /// linear in depth what the integral says.
+    /// Every direction, through a box of constant density: a constant source sends the opacity of the way, and a source
+    /// that is linear in depth what the integral says.
     #[test]
     fn a_box_sends_what_its_depth_says_along_each_axis_and_sense() {
         let n = 8;

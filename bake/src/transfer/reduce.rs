@@ -1,11 +1,11 @@
 //! A matrix of long rows to short ones: the few directions that hold nearly all of it (principal components).
 //!
-//! Clusters are looked for among rows of about a hundred numbers instead of ten thousand. The directions are orthonormal,
-//! so distances between short rows are those between long ones, but for what is left out, which is told. Nothing is
-//! centred: the mean is one more direction.
-//! Two ways: from the Gram matrix of rows that are there ([`of_sample`]), or, for rows too long for one, by a random
-//! sketch of the rows and one more pass (Halko, Martinsson and Tropp 2011, section 5.1, algorithms 4.1 and 5.1), where
-//! the matrix may come in parts of its columns, twice, so that it need never be there as a whole.
+//! Clusters are looked for among rows of about a hundred numbers instead of ten thousand. The directions are
+//! orthonormal, so distances between short rows are those between long ones, but for what is left out, which is told.
+//! Nothing is centred: the mean is one more direction. Two ways: from the Gram matrix of rows that are there
+//! ([`of_sample`]), or, for rows too long for one, by a random sketch of the rows and one more pass (Halko, Martinsson
+//! and Tropp 2011, section 5.1, algorithms 4.1 and 5.1), where the matrix may come in parts of its columns, twice, so
+//! that it need never be there as a whole.
 //! Cost: rows x length x rank for each pass, and rank^3.
 
 use nalgebra::{DMatrix, SymmetricEigen};
@@ -65,7 +65,8 @@ pub fn of_sample(sample: &[f32], length: usize, rank: usize) -> Vec<f32> {
 const OVERSAMPLING: usize = 16;
 
 /// The short rows of a matrix of `rows` rows of `length` numbers that comes in parts of its columns: `parts` are ranges
-/// of columns in order, and `part(i)` gives part i, `[row][its columns]`, the same every time; it is asked for each twice.
+/// of columns in order, and `part(i)` gives part i, `[row][its columns]`, the same every time; it is asked for each
+/// twice.
 pub fn sketch(
     rows: usize,
     length: usize,

@@ -1,8 +1,8 @@
 //! How much of a voxel's light is seen from outside: what an error of its row is worth.
 //!
-//! A voxel of optical depth x that is seen through transmittance T adds `T (1 - e^-x)` of its error to a pixel, so clusters
-//! are fitted to rows times `sqrt(mean over directions of T^2) (1 - e^-x)`: the eye may be anywhere. Without it most rows
-//! are those of the thin rim and of the inside, which hardly count in any image.
+//! A voxel of optical depth x that is seen through transmittance T adds `T (1 - e^-x)` of its error to a pixel, so
+//! clusters are fitted to rows times `sqrt(mean over directions of T^2) (1 - e^-x)`: the eye may be anywhere. Without
+//! it most rows are those of the thin rim and of the inside, which hardly count in any image.
 //! Cost: one sweep for each of 42 directions.
 
 use glam::Vec3;
@@ -82,8 +82,8 @@ mod tests {
         let seen = seen_of_nodes(&field, 20.0);
         let [nx, ny, _] = field.dims;
         let at = |i: usize, j: usize, k: usize| seen[i + nx * (j + ny * k)];
-        // The density rises over half a voxel's depth, 1, before the first node: mean of e^(-2 / mu) over the half of the
-        // sphere outside, E_2(2) / 2 = 0.018767. A mean over 42 directions is good to a few per cent.
+        // The density rises over half a voxel's depth, 1, before the first node: mean of e^(-2 / mu) over the half of
+        // the sphere outside, E_2(2) / 2 = 0.018767. A mean over 42 directions is good to a few per cent.
         let expected = 0.018_767f32.sqrt() * (1.0 - (-2.0f32).exp());
         assert!((at(1, 5, 5) / expected - 1.0).abs() < 0.06, "{} {expected}", at(1, 5, 5));
         assert!(at(5, 5, 5) < 0.01 && at(5, 5, 5) > 0.0, "{}", at(5, 5, 5));

@@ -3,11 +3,10 @@
 //! For local bases with one direction a function, the transfer of light that is scattered once has rank 1: what a voxel
 //! sends out under basis light k is `T(x, l_k) A_k` times the phase function. So one transmittance is kept for each
 //! direction and voxel, whatever the output's bands, and the phase function is applied when the light is known, exactly
-//! at any g. (Zhang et al. 2013, section 6.2, keeps n numbers for each.) Harmonics are sampled on the same mesh.
-//! Each direction is one sweep of sheared columns, O(N), as in [`single_scattering`], which a march from every voxel
-//! would take O(N^(4/3)) for.
-//! Two passes: some voxels' rows give the directions that hold most of all rows ([`super::reduce`]), and then each sweep
-//! is projected on them as it comes, so the whole matrix is never there.
+//! at any g. (Zhang et al. 2013, section 6.2, keeps n numbers for each.) Harmonics are sampled on the same mesh. Each
+//! direction is one sweep of sheared columns, O(N), as in [`single_scattering`], which a march from every voxel would
+//! take O(N^(4/3)) for. Two passes: some voxels' rows give the directions that hold most of all rows
+//! ([`super::reduce`]), and then each sweep is projected on them as it comes, so the whole matrix is never there.
 //! Cost: two sweeps a direction, about 30 operations a node each, and voxels x directions x rank.
 //!
 //! [`single_scattering`]: smoke_runtime::transport::compensated::grid::single::single_scattering
@@ -27,8 +26,8 @@ const SAMPLE: usize = 4096;
 /// Bytes of transmittances that are held at a time.
 const HELD_BYTES: usize = 512 << 20;
 
-/// The transmittances from the basis's directions to the lit nodes of `fields`, one field after the other, reduced to at
-/// most `rank` directions; `done` is told sweeps as they are finished, two for each field and direction.
+/// The transmittances from the basis's directions to the lit nodes of `fields`, one field after the other, reduced to
+/// at most `rank` directions; `done` is told sweeps as they are finished, two for each field and direction.
 pub fn visibility(
     fields: &[&DensityField],
     basis: &LightBasis,

@@ -1,6 +1,7 @@
 //! The host's side of the route through centres: `centres/volume_pass.wgsl`.
 //!
-//! Gaussians and coordinates go up once for a frame, what the Gaussians send once for a light; an eye costs one uniform.
+//! Gaussians and coordinates go up once for a frame, what the Gaussians send once for a light; an eye costs one
+//! uniform.
 
 use super::device::{Gpu, GpuError};
 use super::layouts::CentreVolume as Uniform;

@@ -1,11 +1,12 @@
 //! The host's side of decoding, `medium/gaussian_sum.wgsl` and `medium/decoder.wgsl`: a frame's density on the device.
 //!
 //! Gaussians are placed in the box here, in f64; the residual is uploaded as it lies in memory after it was read from a
-//! pack, and looked up there. Cost: each brick of 8^3 voxels looks at every Gaussian once, and sums those that reach it.
+//! pack, and looked up there. Cost: each brick of 8^3 voxels looks at every Gaussian once, and sums those that reach
+//! it.
 //!
-//! What differs from the processor: a place in radii is rounded twice instead of once, and products and sums may be fused.
-//! A density is off by a few 2^-24 of each of the Gaussians that reach it, and by `exp(-9)` of a weight, 1.2e-4, where a
-//! voxel lies within 2^-22 of the border of a support and is found on its other side.
+//! What differs from the processor: a place in radii is rounded twice instead of once, and products and sums may be
+//! fused. A density is off by a few 2^-24 of each of the Gaussians that reach it, and by `exp(-9)` of a weight, 1.2e-4,
+//! where a voxel lies within 2^-22 of the border of a support and is found on its other side.
 
 use super::device::{Gpu, GpuError};
 use super::layouts::{Decoder as DecoderUniform, GaussianSum as SumUniform};

@@ -1,8 +1,8 @@
 //! Which devices there are, opening one, and what goes wrong with them.
 //!
-//! A device is asked for as much storage as its adapter offers, because frames are large; a caller may force less, which
-//! is how the limits are tested. Failures of a device come late and on other threads: error scopes around each piece of
-//! work and the callback for a lost device turn them into a [`GpuError`] that names the remedy.
+//! A device is asked for as much storage as its adapter offers, because frames are large; a caller may force less,
+//! which is how the limits are tested. Failures of a device come late and on other threads: error scopes around each
+//! piece of work and the callback for a lost device turn them into a [`GpuError`] that names the remedy.
 
 use std::future::Future;
 use std::pin::pin;

@@ -1,9 +1,10 @@
-//! The host's side of GMRES, `transport/compensated/gmres.wgsl`: the vectors are on the device, the small system is here.
+//! The host's side of GMRES, `transport/compensated/gmres.wgsl`: the vectors are on the device, the small system is
+//! here.
 //!
-//! The twin of [`crate::transport::compensated::gmres::solve`], whose small least-squares problem it shares. An iteration is one
-//! submission and one read-back, of its column of the Hessenberg matrix: what a vector is multiplied by stays on the
-//! device. What differs from the processor: sums are f32, in pairs (relative error about 1e-6), so a relative residual
-//! below some 1e-6 is never seen. Memory for up to 33 vectors, the basis as it grows.
+//! The twin of [`crate::transport::compensated::gmres::solve`], whose small least-squares problem it shares. An
+//! iteration is one submission and one read-back, of its column of the Hessenberg matrix: what a vector is multiplied
+//! by stays on the device. What differs from the processor: sums are f32, in pairs (relative error about 1e-6), so a
+//! relative residual below some 1e-6 is never seen. Memory for up to 33 vectors, the basis as it grows.
 
 use super::device::{Gpu, GpuError};
 use super::layouts::Gmres;

@@ -1,8 +1,8 @@
 //! The grid route on the device, from beams to planes of source radiance: nothing but a column of numbers an iteration
 //! comes back to the host.
 //!
-//! The twin of [`crate::transport::compensated::grid::route`], whose choices it shares ([`Plan`]). Grids are kept for the
-//! frame; a change of the light or the medium costs sweeps and solve.
+//! The twin of [`crate::transport::compensated::grid::route`], whose choices it shares ([`Plan`]). Grids are kept for
+//! the frame; a change of the light or the medium costs sweeps and solve.
 
 use super::device::{Gpu, GpuError};
 use super::gmres::GmresPass;

@@ -1,8 +1,9 @@
 //! The host's side of the view pass, `march.wgsl`: a film from a volume on the device.
 //!
 //! What differs from the processor: places are f32 (see the shader), azimuths of environments are as exact as the
-//! device's `atan2` (Vulkan allows 4,096 units in the last place, 2e-4 of a turn). At half resolution the processor reads
-//! the pixels between the coarse ones, and the device marches those that need rays of their own. Pixels are done in runs of at most 2^20 rays, so that no submission takes so long that a driver gives up on it.
+//! device's `atan2` (Vulkan allows 4,096 units in the last place, 2e-4 of a turn). At half resolution the processor
+//! reads the pixels between the coarse ones, and the device marches those that need rays of their own. Pixels are done
+//! in runs of at most 2^20 rays, so that no submission takes so long that a driver gives up on it.
 
 use super::device::{Gpu, GpuError};
 use super::layouts::{Environment, March, Pixel as DevicePixel};
@@ -156,7 +157,8 @@ impl MarchPass {
     }
 }
 
-/// Everything but the pixels of a dispatch, for an image of `size` columns and rows. All differences of large numbers are taken here, in f64.
+/// Everything but the pixels of a dispatch, for an image of `size` columns and rows. All differences of large numbers
+/// are taken here, in f64.
 fn placed(
     volume: &DeviceVolume,
     camera: &Camera,

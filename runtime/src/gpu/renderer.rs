@@ -1,9 +1,9 @@
 //! The calls of [`Renderer`], with the grid route, transfer and the view pass on a device.
 //!
-//! Decoding is the processor's, and so is the projection of light onto transfer, whose result is copied. The
-//! solution at centres is the solver's, with the device's kernels ([`super::centre_solve`]). A frame comes as it was uploaded
-//! ([`UploadedFrame`]). Kept until an edit makes them void: grids, planes, light of clusters, nodes of bricks and backdrop on
-//! the device. So other light costs sweeps and solve, another view the volume pass and the march.
+//! Decoding is the processor's, and so is the projection of light onto transfer, whose result is copied. The solution
+//! at centres is the solver's, with the device's kernels ([`super::centre_solve`]). A frame comes as it was uploaded
+//! ([`UploadedFrame`]). Kept until an edit makes them void: grids, planes, light of clusters, nodes of bricks and
+//! backdrop on the device. So other light costs sweeps and solve, another view the volume pass and the march.
 
 use super::centre_solve::DeviceKernels;
 use super::centres::{CentrePass, DeviceCentres};
@@ -196,8 +196,8 @@ impl GpuRenderer {
         Ok((film, seconds))
     }
 
-    /// The grid route up to its shaded volume; gives what is marched and what is behind it, none for other routes and before
-    /// any frame.
+    /// The grid route up to its shaded volume; gives what is marched and what is behind it, none for other routes and
+    /// before any frame.
     fn shade_grid(&mut self, camera: &Camera, seconds: &mut Seconds) -> Result<Option<Shaded>, GpuRenderError> {
         let start = Instant::now();
         let (Some(Unlit { problem, medium, sky }), Some(loaded)) = (self.solver.unlit(), &mut self.loaded) else {

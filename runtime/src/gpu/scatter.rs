@@ -1,8 +1,8 @@
 //! The host's side of the gather, `transport/compensated/grid/scatter.wgsl`.
 //!
 //! Planes hold the nodes near density alone: nothing else is read with weight, so vectors are as small as they can be.
-//! What differs from the processor is the order of sums over ordinates, and rounding where sums are fused. Cost: of a node
-//! and ordinate one visit for each coefficient, twice, and one of a ray.
+//! What differs from the processor is the order of sums over ordinates, and rounding where sums are fused. Cost: of a
+//! node and ordinate one visit for each coefficient, twice, and one of a ray.
 
 use super::device::{Gpu, GpuError};
 use super::layouts::Scatter;
@@ -60,8 +60,8 @@ impl ScatterPass {
         })
     }
 
-    /// The gather along `ordinates`, times `gain(plane)`; `sigma_t` is extinction per unit density and world length, one for
-    /// each channel.
+    /// The gather along `ordinates`, times `gain(plane)`; `sigma_t` is extinction per unit density and world length,
+    /// one for each channel.
     pub fn gather<'a>(
         &'a self,
         gpu: &Gpu,

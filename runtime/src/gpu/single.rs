@@ -1,8 +1,8 @@
 //! The host's side of single scattering, `transport/compensated/grid/single.wgsl`.
 //!
-//! Beams are swept in batches, and each batch is added to all planes before the next; one submission a batch. What differs
-//! from the processor is rounding where sums are fused. Cost: a visit a ray and slice for each beam, then four reads a
-//! node, beam and run of 16 coefficients of a channel.
+//! Beams are swept in batches, and each batch is added to all planes before the next; one submission a batch. What
+//! differs from the processor is rounding where sums are fused. Cost: a visit a ray and slice for each beam, then four
+//! reads a node, beam and run of 16 coefficients of a channel.
 
 use super::device::{Gpu, GpuError};
 use super::layouts::Single;
@@ -38,9 +38,9 @@ impl SinglePass {
         Ok(Self { carry: kernel("carry")?, light: kernel("light")? })
     }
 
-    /// Source radiance of all beams, planes `[coefficient * channels + channel]`; of no beams, a plane a channel. Planes hold
-    /// all nodes, zero far from density, or where `compact` those near density alone. `sigma_t` is extinction per unit
-    /// density and world length, one for each channel.
+    /// Source radiance of all beams, planes `[coefficient * channels + channel]`; of no beams, a plane a channel.
+    /// Planes hold all nodes, zero far from density, or where `compact` those near density alone. `sigma_t` is
+    /// extinction per unit density and world length, one for each channel.
     pub fn source_radiance(
         &self,
         gpu: &Gpu,

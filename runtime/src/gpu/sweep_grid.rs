@@ -1,8 +1,8 @@
 //! A frame's grid on the device, and the ways of light through it in batches.
 //!
-//! The twin of [`crate::transport::compensated::grid::columns`]. Where rays lie on a slice is computed here, in f64, and
-//! uploaded: 16 bytes a direction and slice. What the rays of a batch carry is held for all slices, up to [`MOST_BYTES`]:
-//! about one value a node, direction and quantity.
+//! The twin of [`crate::transport::compensated::grid::columns`]. Where rays lie on a slice is computed here, in f64,
+//! and uploaded: 16 bytes a direction and slice. What the rays of a batch carry is held for all slices, up to
+//! [`MOST_BYTES`]: about one value a node, direction and quantity.
 
 use super::device::{Gpu, GpuError};
 use super::layouts::{Path as DevicePath, Shift};
@@ -120,8 +120,8 @@ impl DeviceSweepGrid {
     }
 }
 
-/// A table of factors `[direction][coefficient * channels + channel]` as the shaders read it, `[direction][channel]` and
-/// coefficients in vectors of four, padded to 16; and how many vectors.
+/// A table of factors `[direction][coefficient * channels + channel]` as the shaders read it, `[direction][channel]`
+/// and coefficients in vectors of four, padded to 16; and how many vectors.
 pub(super) fn quads<'a>(rows: impl Iterator<Item = &'a [f32]>, channels: usize) -> (Vec<f32>, usize) {
     let (mut out, mut padded) = (Vec::new(), 16);
     for row in rows {

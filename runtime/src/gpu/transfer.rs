@@ -4,9 +4,9 @@
 //! and what suns let through ([`TransferPass::light`]); a change of the view ([`TransferPass::shade`], in
 //! [`super::transfer_view`]) uploads the directions in use.
 //!
-//! What differs from the processor: ways from the eye are taken in f32, and sums may be fused: see `tests/gpu_transfer.rs`
-//! for how far. Costs are those of [`crate::transport::transfer::source`], and a cell's moments are mixed again for each
-//! view instead of being stored.
+//! What differs from the processor: ways from the eye are taken in f32, and sums may be fused: see
+//! `tests/gpu_transfer.rs` for how far. Costs are those of [`crate::transport::transfer::source`], and a cell's moments
+//! are mixed again for each view instead of being stored.
 
 use super::device::{Gpu, GpuError};
 use super::layouts::{Product, ViewDirections as ViewsUniform};
@@ -118,8 +118,8 @@ impl DeviceTransfer {
 }
 
 impl DeviceLight {
-    /// Lit clusters, set by set, first direct where they are the same from everywhere, then indirect: `[cluster][1 + terms]`
-    /// vectors, or those for each coefficient. For comparisons.
+    /// Lit clusters, set by set, first direct where they are the same from everywhere, then indirect: `[cluster][1 +
+    /// terms]` vectors, or those for each coefficient. For comparisons.
     pub fn read(&self, gpu: &Gpu, frame: &DeviceTransfer) -> Result<Vec<Vec<[f32; 4]>>, GpuError> {
         let n = frame.rows.bands * frame.rows.bands;
         let even = self.even.iter().zip(&frame.rows.direct).map(|(buffer, set)| (buffer, set.vectors));
@@ -134,7 +134,8 @@ impl TransferPass {
         Self::from_sources(gpu, [PRODUCT, VIEW_DIRECTIONS, CELLS, SOURCE])
     }
 
-    /// From other texts of the same bindings, in the order of [`Self::new`]: how a planted difference is shown to be found.
+    /// From other texts of the same bindings, in the order of [`Self::new`]: how a planted difference is shown to be
+    /// found.
     pub fn from_sources(gpu: &Gpu, [product, views, cells, source]: [&str; 4]) -> Result<Self, GpuError> {
         let kernel = |text, entry| Kernel::new(gpu, "transfer", text, entry);
         Ok(Self {

@@ -1,8 +1,8 @@
-//! What a frame's transfer is on the device, whatever light and view: clusters, and how the rows of nodes and cells are mixed
-//! of them.
+//! What a frame's transfer is on the device, whatever light and view: clusters, and how the rows of nodes and cells are
+//! mixed of them.
 //!
-//! It follows from the frame alone and is only read, so it is made ahead and shared. Cost: a few operations a node to find
-//! the rows, and the bytes of clusters and mixes.
+//! It follows from the frame alone and is only read, so it is made ahead and shared. Cost: a few operations a node to
+//! find the rows, and the bytes of clusters and mixes.
 
 use super::device::{Gpu, GpuError};
 use super::renderer::GpuRenderError;

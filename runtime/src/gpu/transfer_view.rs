@@ -1,8 +1,9 @@
-//! A change of the view with transfer: `transport/transfer/{cells,source}.wgsl`, from the lit clusters to the bricks' nodes.
+//! A change of the view with transfer: `transport/transfer/{cells,source}.wgsl`, from the lit clusters to the bricks'
+//! nodes.
 //!
 //! In order: what cells send towards the eye, that at the nodes, direct light of clusters, that of suns, density. The
-//! directions that the smoke is seen in are found by the processor, from the bricks' corners: a few kB. Their clusters are
-//! lit as many at a time as there is room for, and rows are as many as a shader may see: nodes add up.
+//! directions that the smoke is seen in are found by the processor, from the bricks' corners: a few kB. Their clusters
+//! are lit as many at a time as there is room for, and rows are as many as a shader may see: nodes add up.
 
 use super::device::{Gpu, GpuError};
 use super::layouts::{Cells as CellsUniform, Transfer as TransferUniform};

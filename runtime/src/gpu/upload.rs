@@ -1,13 +1,13 @@
-//! A frame on the device before it is drawn: density, bricks and transfer, which are the same under any light and for any
-//! eye.
+//! A frame on the device before it is drawn: density, bricks and transfer, which are the same under any light and for
+//! any eye.
 //!
-//! It is made on any thread, also while another frame is drawn, and only read from then on, so that renderers share it. The
-//! copies are submitted when it is made, and a later submission finds them done. What drawing writes (nodes of the bricks,
-//! light of the transfer) belongs to the renderer: of a frame that waits for its turn the device holds four bytes a node, and
-//! its transfer.
+//! It is made on any thread, also while another frame is drawn, and only read from then on, so that renderers share it.
+//! The copies are submitted when it is made, and a later submission finds them done. What drawing writes (nodes of the
+//! bricks, light of the transfer) belongs to the renderer: of a frame that waits for its turn the device holds four
+//! bytes a node, and its transfer.
 //!
-//! Error scopes of a device belong to the thread that opens them, so what fails here is an error here, never in the picture
-//! that another thread is drawing.
+//! Error scopes of a device belong to the thread that opens them, so what fails here is an error here, never in the
+//! picture that another thread is drawing.
 
 use super::device::Gpu;
 use super::renderer::GpuRenderError;

@@ -52,8 +52,8 @@ pub(super) fn wide(v: [usize; 3]) -> [u32; 4] {
     [v[0] as u32, v[1] as u32, v[2] as u32, 0]
 }
 
-/// An eye of the world in node space, and the columns of the map to the world scaled to at most 1, which give directions
-/// alone, as uniforms have them.
+/// An eye of the world in node space, and the columns of the map to the world scaled to at most 1, which give
+/// directions alone, as uniforms have them.
 pub(super) fn seen_from(eye: DVec3, field: &DensityField) -> [[f32; 4]; 4] {
     let linear = field.world_from_node.matrix3;
     let largest = linear.to_cols_array().into_iter().fold(0.0f64, |m, v| m.max(v.abs()));

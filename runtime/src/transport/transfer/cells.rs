@@ -1,8 +1,8 @@
 //! The cells that indirect light is kept in: cubes of `2^shift` voxels a side, those with density, x fastest.
 //!
-//! What is kept of a cell is the mean over its *density*, `int D f / int D`: then the light that a cell scatters is exact,
-//! and an edge of smoke that cuts a cell is not mixed with the empty part. Between cells, values are trilinear between
-//! their middles; cells without density do not count, and the weights of the others are made to add up to 1.
+//! What is kept of a cell is the mean over its *density*, `int D f / int D`: then the light that a cell scatters is
+//! exact, and an edge of smoke that cuts a cell is not mixed with the empty part. Between cells, values are trilinear
+//! between their middles; cells without density do not count, and the weights of the others are made to add up to 1.
 //! Cost: O(nodes) to make; to read, four look-ups a cell for each line of nodes, and two a node.
 
 use crate::medium::field::DensityField;
@@ -110,17 +110,17 @@ impl Cells {
         self.mass.is_empty()
     }
 
-    /// The cells next to a place along one axis, and how far it is from the first to the second, in cells: the first may
-    /// be one before the box, and the second one after it.
+    /// The cells next to a place along one axis, and how far it is from the first to the second, in cells: the first
+    /// may be one before the box, and the second one after it.
     #[inline(always)]
     fn next_to(&self, node: usize) -> (isize, f32) {
         let at = node as f32 / (1u32 << self.shift) as f32 - 0.5;
         (at.floor() as isize, at - at.floor())
     }
 
-    /// Sums of `values`, one a cell with density whose last component is 1, over the four cells around the line of nodes
-    /// at `[j, k]`, for each cell along x, one before and one after the box included; those that nodes `from` to `to` are
-    /// not between are left at zero.
+    /// Sums of `values`, one a cell with density whose last component is 1, over the four cells around the line of
+    /// nodes at `[j, k]`, for each cell along x, one before and one after the box included; those that nodes `from` to
+    /// `to` are not between are left at zero.
     pub fn line(&self, node: [usize; 2], [from, to]: [usize; 2], values: &[Vec4]) -> Vec<Vec4> {
         let [bx, by, bz] = self.majorants.bricks;
         let mut out = vec![Vec4::ZERO; bx + 2];
@@ -141,7 +141,8 @@ impl Cells {
         out
     }
 
-    /// The value at node `i` of a line, over its weights' sum in the last component; zero if no cell around has density.
+    /// The value at node `i` of a line, over its weights' sum in the last component; zero if no cell around has
+    /// density.
     #[inline(always)]
     pub fn between(&self, i: usize, line: &[Vec4]) -> Vec4 {
         let (x, f) = self.next_to(i);
@@ -151,8 +152,8 @@ impl Cells {
     }
 }
 
-/// Values at the `n` nodes of lines that are `stride` apart to the integrals of their piecewise linear function with the
-/// hat function of each node.
+/// Values at the `n` nodes of lines that are `stride` apart to the integrals of their piecewise linear function with
+/// the hat function of each node.
 fn weigh(values: &mut [f64], n: usize, stride: usize) {
     for start in (0..values.len()).filter(|at| (at / stride).is_multiple_of(n)) {
         let mut before = 0.0;
@@ -190,7 +191,8 @@ mod tests {
 
     #[test]
     fn means_over_the_density_are_those_of_the_trilinear_product() {
-        // D = x + 2 y, f = 3 - x + z (and 1) in cells of two voxels: both trilinear, so that the integrals are polynomials.
+        // D = x + 2 y, f = 3 - x + z (and 1) in cells of two voxels: both trilinear, so that the integrals are
+        // polynomials.
         let dims = [5, 5, 7];
         let at = |v: usize| [v % 5, v / 5 % 5, v / 25].map(|n| n as f64);
         let of = |f: &dyn Fn([f64; 3]) -> f64| (0..175).map(|v| f(at(v)) as f32).collect::<Vec<f32>>();
