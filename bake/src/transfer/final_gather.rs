@@ -17,17 +17,16 @@
 //! ordinate, light and gathering about `3 bands^2 + 30` operations.
 
 use super::photons::GreyMedium;
-use super::rays::{LANES, Lanes, Placed, Rays, of_slices};
+use super::rays::{LANES, Lanes, Placed, Rays, advance, of_slices};
+use super::visibility::sweeps;
 use glam::{DAffine3, DVec3, Vec3};
 use rayon::prelude::*;
 use smoke_runtime::medium::field::DensityField;
-use smoke_runtime::sphere::harmonics::BAND;
 use smoke_runtime::sphere::icosphere::Icosphere;
 use smoke_runtime::sphere::light_basis::{BasisKind, LightBasis};
 use smoke_runtime::transport::compensated::grid::columns::{Path, SweepGrid};
 use smoke_runtime::transport::compensated::grid::route::ordinates;
 use smoke_runtime::transport::compensated::grid::scatter::Ordinate;
-use smoke_runtime::transport::compensated::grid::single::transmittance_from;
 use smoke_runtime::transport::transfer::cells::Cells;
 use std::ops::Range;
 
@@ -38,8 +37,6 @@ const LARGEST_G: f32 = 0.75;
 const RINGS: usize = 6;
 /// How much of what is sent on to be gathered last is the photons'; the rest was gathered from them before.
 const PHOTONS_SHARE: f32 = 0.5;
-/// Bytes of transmittances that are held at a time.
-const HELD_BYTES: usize = 256 << 20;
 
 /// What light is gathered through: one frame and medium.
 pub struct FinalGather<'a> {
@@ -128,11 +125,9 @@ impl<'a> FinalGather<'a> {
     /// Calls `visit(first, count, means)` with the transmittance from `count` directions from `first` on to each cell,
     /// some at a time: `[cell][count]`.
     fn transmittances(&self, toward: &[Vec3], mut visit: impl FnMut(usize, usize, &[f32])) {
-        let held = (HELD_BYTES / (4 * self.field.values.len())).max(8);
-        for (directions, first) in toward.chunks(held).zip((0..).step_by(held)) {
-            let planes = transmittance_from(&self.voxels, directions, self.medium.sigma_t);
-            visit(first, directions.len(), &self.cells.means(self.field, &planes));
-        }
+        sweeps(&self.voxels, toward, self.medium.sigma_t, |first, planes| {
+            visit(first, planes.len(), &self.cells.means(self.field, planes));
+        });
     }
 
     /// Replaces the photons' moments of the lights `wanted`, `[cell][light - wanted.start][l (l + 1) + m]`, by gathered
@@ -178,7 +173,7 @@ impl<'a> FinalGather<'a> {
             block.reaches.iter_mut().zip(&first[k].reaches).for_each(|(out, v)| out[lane] = *v);
             block.phase.iter_mut().zip(&first[k].phase).for_each(|(out, v)| out[lane] = *v);
         }
-        let gains: Vec<f32> = (0..n).map(|lm| self.medium.albedo * self.medium.g.powi(BAND[lm] as i32)).collect();
+        let gains: Vec<f32> = (0..n).map(|lm| self.medium.gain(lm)).collect();
         // The first time what the photons left is sent on, then the mean of that and of what was gathered.
         for share in [1.0, PHOTONS_SHARE] {
             for (cell, row) in photons.chunks_exact(first.len() * n).enumerate() {
@@ -234,7 +229,17 @@ impl<'a> FinalGather<'a> {
                         }
                     }
                 };
-                rays.advance(&self.grid, &self.paths[o], step, self.medium.sigma_t, cells, &mut emitted, emit, receive);
+                advance(
+                    rays,
+                    &self.grid,
+                    &self.paths[o],
+                    step,
+                    self.medium.sigma_t,
+                    cells,
+                    &mut emitted,
+                    emit,
+                    receive,
+                );
             }
         }
     }

@@ -22,7 +22,6 @@ use reduce::{Reduced, sketch};
 use seen::{seen_of_cells, seen_of_nodes, weights};
 use smoke_runtime::medium::field::DensityField;
 use smoke_runtime::product::add_product;
-use smoke_runtime::sphere::harmonics::BAND;
 use smoke_runtime::sphere::light_basis::{BasisKind, LightBasis};
 use smoke_runtime::transport::medium::MediumParameters;
 use smoke_runtime::transport::transfer::cells::Cells;
@@ -260,7 +259,7 @@ fn indirect(
         }
         for row in values.chunks_exact_mut(n) {
             for (lm, v) in row.iter_mut().enumerate() {
-                *v *= medium.albedo * medium.g.powi(BAND[lm] as i32);
+                *v *= medium.gain(lm);
             }
         }
         let values = Arc::new(values);

@@ -22,7 +22,7 @@
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 use smoke_runtime::medium::field::DensityField;
-use smoke_runtime::sphere::harmonics::evaluate;
+use smoke_runtime::sphere::harmonics::{BAND, evaluate};
 use smoke_runtime::sphere::light_basis::{BasisKind, LightBasis};
 use smoke_runtime::tracking::flight::{Column, Ray, Space, Steps};
 use smoke_runtime::tracking::phase;
@@ -53,6 +53,13 @@ pub struct GreyMedium {
     pub albedo: f32,
     /// Henyey–Greenstein mean cosine.
     pub g: f32,
+}
+
+impl GreyMedium {
+    /// How much of the moment `l (l + 1) + m` of incident light is scattered on: `albedo g^l`.
+    pub fn gain(&self, moment: usize) -> f32 {
+        self.albedo * self.g.powi(BAND[moment] as i32)
+    }
 }
 
 /// How many photons, and of what.

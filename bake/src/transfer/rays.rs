@@ -53,30 +53,14 @@ impl Rays {
         let lanes = vec![[0.0; LANES]; count];
         Self { density: vec![0.0; count], source: lanes.clone(), radiance: lanes, opacity: vec![0.0; count] }
     }
-
-    /// Carries the rays to slice number `step` of their way. `emit(cell)` is the source radiance of a cell of that
-    /// slice along them; `receive(cell, radiance, opacity)` is told what has arrived there, and what a source of 1
-    /// would have sent. `emitted` is scratch, one a node of a slice.
-    #[expect(clippy::too_many_arguments, reason = "the inner loop of a sweep")]
-    pub fn advance(
-        &mut self,
-        grid: &SweepGrid,
-        path: &Path,
-        step: usize,
-        sigma_t: f32,
-        cells: &[Placed],
-        emitted: &mut [Lanes],
-        emit: impl Fn(usize) -> Lanes,
-        receive: impl FnMut(usize, Lanes, f32),
-    ) {
-        advance(self, grid, path, step, sigma_t, cells, emitted, emit, receive);
-    }
 }
 
-/// See [`Rays::advance`].
+/// Carries rays to slice number `step` of their way. `emit(cell)` is the source radiance of a cell of that slice along
+/// them; `receive(cell, radiance, opacity)` is told what has arrived there, and what a source of 1 would have sent.
+/// `emitted` is scratch, one a node of a slice.
 #[expect(clippy::too_many_arguments, reason = "the inner loop of a sweep")]
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512dq+avx512vl+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn advance(
+pub fn advance(
     rays: &mut Rays,
     grid: &SweepGrid,
     path: &Path,
@@ -192,12 +176,22 @@ mod tests {
                     (0..3).all(|a| a == axis || at[a] == n / 2)
                 };
                 let mut arrived = None;
-                rays.advance(&grid, &path, step, 0.3, &slices[slice], &mut emitted, emit, |cell, radiance, opacity| {
-                    seen += 1;
-                    if middle(cell) {
-                        arrived = Some((radiance, opacity));
-                    }
-                });
+                advance(
+                    &mut rays,
+                    &grid,
+                    &path,
+                    step,
+                    0.3,
+                    &slices[slice],
+                    &mut emitted,
+                    emit,
+                    |cell, radiance, opacity| {
+                        seen += 1;
+                        if middle(cell) {
+                            arrived = Some((radiance, opacity));
+                        }
+                    },
+                );
                 assert_eq!(seen, slices[slice].len());
                 // Density along the middle line: 1 inside, a half at both ends, 0 on the border.
                 let at = |step: usize| match step {

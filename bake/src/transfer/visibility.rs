@@ -47,7 +47,7 @@ pub fn visibility(
     for frame in &frames {
         let sampled: Vec<u32> = frame.nodes.iter().copied().step_by(every).collect();
         let mut rows = vec![0.0f32; sampled.len() * length];
-        frame.sweep(&toward, sigma_t, |first, planes| {
+        sweeps(&frame.grid, &toward, sigma_t, |first, planes| {
             rows.par_chunks_exact_mut(length).zip(&sampled).for_each(|(row, &node)| {
                 row[first..].iter_mut().zip(planes).for_each(|(v, plane)| *v = plane[node as usize]);
             });
@@ -62,7 +62,7 @@ pub fn visibility(
     for frame in &frames {
         let (rows, after) = std::mem::take(&mut rest).split_at_mut(frame.nodes.len() * rank);
         rest = after;
-        frame.sweep(&toward, sigma_t, |first, planes| {
+        sweeps(&frame.grid, &toward, sigma_t, |first, planes| {
             reduced.energy += project(rows, &frame.nodes, planes, first, &reduced.directions, length);
             done(planes.len() as u64);
         });
@@ -74,20 +74,20 @@ pub fn visibility(
 struct Frame {
     grid: SweepGrid,
     nodes: Vec<u32>,
-    held: usize,
 }
 
 impl Frame {
     fn new(field: &DensityField) -> Self {
-        let held = (HELD_BYTES / (4 * field.values.len())).max(8);
-        Self { grid: SweepGrid::new(field), nodes: lit_nodes(field), held }
+        Self { grid: SweepGrid::new(field), nodes: lit_nodes(field) }
     }
+}
 
-    /// Calls `visit(first, planes)` with the transmittances from the directions from `first` on, some at a time.
-    fn sweep(&self, toward: &[Vec3], sigma_t: f32, mut visit: impl FnMut(usize, &[Vec<f32>])) {
-        for (chunk, first) in toward.chunks(self.held).zip((0..).step_by(self.held)) {
-            visit(first, &transmittance_from(&self.grid, chunk, sigma_t));
-        }
+/// Calls `visit(first, planes)` with the transmittances from the directions from `first` on, as many at a time as
+/// [`HELD_BYTES`] hold.
+pub fn sweeps(grid: &SweepGrid, toward: &[Vec3], sigma_t: f32, mut visit: impl FnMut(usize, &[Vec<f32>])) {
+    let held = (HELD_BYTES / (4 * grid.len())).max(8);
+    for (chunk, first) in toward.chunks(held).zip((0..).step_by(held)) {
+        visit(first, &transmittance_from(grid, chunk, sigma_t));
     }
 }
 
